@@ -1,5 +1,6 @@
 """The nightly flow: logs of star sensors go in, a dataset of space objects comes out."""
 
+import dataclasses
 import logging
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
@@ -11,7 +12,7 @@ from prefect import flow
 
 from epipole.flows.night.calibrating import calibrate, find_cameras
 from epipole.flows.night.log_checks import check_logs, check_readings
-from epipole.flows.night.log_choice import Night, find_logs, night_asked, run_name
+from epipole.flows.night.log_choice import LastNights, Night, find_logs, night_asked, run_name
 from epipole.flows.night.recorded_nights import (
     EarlierNights,
     gave_something,
@@ -39,7 +40,8 @@ from epipole.flows.night.summary import Summary, by_reason, many, summarise
 from epipole.flows.night.work import Work, plan_spans
 from epipole.flows.prefect.artifacts import shown_on_page
 from epipole.flows.prefect.runners import runner_asked
-from epipole.io.catalogues.element_sets import read_known_objects
+from epipole.flows.prefect.waiting_runs import waiting_nights
+from epipole.io.catalogues.element_sets import KnownObjects, read_known_objects
 from epipole.io.catalogues.star_catalogue import check_star_catalogue
 from epipole.io.datasets.dataset import (
     check_folder,
@@ -51,10 +53,11 @@ from epipole.io.datasets.rows_by_night import nights_of
 from epipole.io.paths import known_as
 from epipole.io.settings_file import merged_settings
 from epipole.io.work.folder import work_folder, work_root
-from epipole.io.work.recipe import recipe_of
+from epipole.io.work.recipe import Recipe, recipe_of
 from epipole.io.work.work_layout import ReadFolder, SolvedParts, WorkFolder
 from epipole.schemas.bridge import concat
-from epipole.schemas.errors import LogError, NoFramesError
+from epipole.schemas.dates import LAST_NIGHTS, YESTERDAY, nights_before
+from epipole.schemas.errors import EpipoleError, LogError, NoFramesError
 from epipole.schemas.rejects import Reason
 from epipole.schemas.settings import Settings
 from epipole.schemas.tables import REJECTS
@@ -78,6 +81,7 @@ def nightly(
     known: str | None = None,
     again: bool = False,
     settings_file: str | None = None,
+    last_nights: LastNights = LAST_NIGHTS,
 ) -> Summary:
     """Turn logs into a dataset.
 
@@ -95,18 +99,59 @@ def nightly(
         again: Make a night again even if nothing has changed since it was made.
         settings_file: A file of settings (TOML): a path or URL that the worker can read. Settings
             that are given count more.
+        last_nights: With night yesterday, the number of nights that are made, in order, where a
+            log has come since or anything else has changed; yesterday is the last of them.
 
     Raises:
         EpipoleError: If the work cannot be done; the dataset is then unchanged.
     """
     logs = [known_as(where) for where in ([logs] if isinstance(logs, str) else logs)]
     out, known = known_as(out), None if known is None else known_as(known)
-    night = night_asked(night)
+    asked = night_asked(night)
     settings = merged_settings(settings_file, settings)
     check_folder(out)
     check_star_catalogue(settings.identification.catalogue)
     catalogue = read_known_objects(known) if known else None
-    given = find_logs(logs, night)
+    order = Order(logs, out, settings, catalogue, replace, again, {})
+    before = waiting_nights()
+    if night == YESTERDAY and asked is not None:
+        before |= set(nights_before(asked, last_nights - 1))
+    earlier = [made_before(order, date) for date in sorted(before) if asked and date < asked]
+    summary = make_nights(order, asked)
+    return dataclasses.replace(summary, earlier=tuple(filter(None, earlier)))
+
+
+class Order(NamedTuple):
+    """What is asked of a run, but for the nights; `logged` is for `find_logs`."""
+
+    logs: list[str]
+    out: str
+    settings: Settings
+    catalogue: KnownObjects | None
+    replace: bool
+    again: bool
+    logged: dict[str, tuple[int, int] | None]
+
+
+def made_before(order: Order, night: str) -> str | None:
+    """Make a night before the one that is asked for; return a sentence, None if nothing was to do.
+
+    What is wrong with it does not stop the night that is asked for.
+    """
+    try:
+        summary = make_nights(order._replace(again=False), night)
+    except NoFramesError:
+        return None
+    except EpipoleError as error:
+        LOGGER.warning("night %s: %s", night, error)
+        return f"{night} failed: {error}"
+    return None if summary.unchanged else f"{night} made: {summary.sentence()}"
+
+
+def make_nights(order: Order, night: str | None) -> Summary:
+    """Make a night, or all nights that the logs have frames of (None), where one has changed."""
+    logs, out, settings, catalogue, replace, again, logged = order
+    given = find_logs(logs, night, logged)
     LOGGER.info("found %s%s", many(len(given.paths), "log"), f" of {night}" if night else "")
     known_key = catalogue.sha256 if catalogue else None
     if not again and (same := unchanged_nights(out, given, night, settings, known_key)):
@@ -115,46 +160,57 @@ def nightly(
     # Locks are released by `with`: a signal while an ExitStack takes one would leave it locked.
     with lock_nights(out, [night] if night else []) as run:
         frames = read(given.paths, ReadFolder(run), settings)
-
         nights = nights_of(frames.starts_ns)
         chosen = choose_nights(given.paths, nights, night, frames.rejects)
         sources = source_table(frames.sources, settings)
         check_sources(out, chosen, sources, replace)
-        rejects = concat(REJECTS, [given.rejects, frames.rejects])
         staged: dict[str, Path] = {}
         with lock_nights(out, [] if night else chosen) as staging, ExitStack() as kept:
             for date in chosen:
                 if len(chosen) > 1:
                     LOGGER.info("night %s", date)
                 gave = gave_something(frames.sources, frames.rejects, date)
-                key = night_logs_key(given, date, *gave)
-                recipe = recipe_of(key, settings, known_key)
+                recipe = recipe_of(night_logs_key(given, date, *gave), settings, known_key)
                 work = work_folder(work_root(out), date, recipe.work_key(date))
                 folder = WorkFolder(kept.enter_context(work))
-                made = make_night(frames, date, folder, settings)
-                earlier = EarlierNights(out, staged)
-                earlier_key = earlier.key(date, settings)
-                names = name(made.work, made.solved, date, earlier.last_views(date), settings)
-                elements, unused = choose_elements(catalogue, date, settings)
-                whole = {"sources": sources, **made.tables,
-                         "rejects": concat(REJECTS, [into_nights(rejects, nights, date),
-                                                     made.rejects, unused])}  # fmt: skip
-                staged[date] = staging / f"night={date}"
-                linked = write_night(
-                    made.work, made.solved, date, names, whole, staged[date], settings
+                rejects = into_nights(
+                    concat(REJECTS, [given.rejects, frames.rejects]), nights, date
                 )
-                misfits = determine_orbits(staged[date], date, linked)
-                states = earlier.last_states(date, settings)
-                residuals = name_known(staged[date], elements, states, settings)
-                list_objects(staged[date], date, misfits)
-                faults = [verdict for verdict in made.work.verdicts if verdict.is_faulty]
-                write_night_row(staged[date], recipe, earlier_key, faults, residuals)
+                whole = {"sources": sources, "rejects": rejects}
+                earlier = EarlierNights(out, staged)
+                folder_of_night = staging / f"night={date}"
+                stage_night(frames, date, folder, whole, earlier, catalogue, recipe,
+                            folder_of_night, settings)  # fmt: skip
+                staged[date] = folder_of_night
             summary = publish(Destination(out, staged, replace), sources)
             if settings.report.write:
                 summary = with_reports(summary, staged, staging)
-    dataset = out.rstrip("/")
-    LOGGER.info("published %s", ", ".join(f"{dataset}/night={date}" for date in chosen))
+    LOGGER.info("published %s", ", ".join(f"{out.rstrip('/')}/night={date}" for date in chosen))
     return summary
+
+
+def stage_night(
+    frames: OrderedFrames, date: str, folder: WorkFolder, whole: Mapping[str, pa.Table],
+    earlier: EarlierNights, catalogue: KnownObjects | None, recipe: Recipe, staged: Path,
+    settings: Settings,
+) -> None:  # fmt: skip
+    """Make a night from the frames of a run, and write its tables to the folder `staged`.
+
+    `whole` are `sources` and `rejects` of the run.
+    """
+    made = make_night(frames, date, folder, settings)
+    earlier_key = earlier.key(date, settings)
+    names = name(made.work, made.solved, date, earlier.last_views(date), settings)
+    elements, unused = choose_elements(catalogue, date, settings)
+    rejects = concat(REJECTS, [whole["rejects"], made.rejects, unused])
+    whole = {**whole, **made.tables, "rejects": rejects}
+    linked = write_night(made.work, made.solved, date, names, whole, staged, settings)
+    misfits = determine_orbits(staged, date, linked)
+    states = earlier.last_states(date, settings)
+    residuals = name_known(staged, elements, states, settings)
+    list_objects(staged, date, misfits)
+    faults = [verdict for verdict in made.work.verdicts if verdict.is_faulty]
+    write_night_row(staged, recipe, earlier_key, faults, residuals)
 
 
 class MadeNight(NamedTuple):

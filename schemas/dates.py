@@ -5,6 +5,8 @@ import re
 
 # The years all of whose instants are nanoseconds since 1970 in 64 bits.
 FIRST_YEAR, LAST_YEAR = 1678, 2261
+YESTERDAY = "yesterday"  # the day before a run is due
+LAST_NIGHTS = 3  # that are made with it: the log of one of them may come late
 _DATE = re.compile(r"\d{4}-\d\d-\d\d", re.ASCII)
 
 
@@ -18,3 +20,9 @@ def is_night(text: object) -> bool:
         )
     except ValueError:
         return False
+
+
+def nights_before(night: str, count: int) -> list[str]:
+    """Return the last nights before a night, in order."""
+    day = datetime.date.fromisoformat(night)
+    return [(day - datetime.timedelta(days=k)).isoformat() for k in range(count, 0, -1)]

@@ -36,7 +36,7 @@ def nights(
 
     A night is stale if a run would make it otherwise today: other code, settings or
     catalogues, or another night before it, whose objects it follows. `epipole run
-    --stale` makes these again. Logs are not looked at.
+    LOG... --stale` makes these again, and those whose logs have changed.
     """
     from epipole.flows.night.recorded_nights import published_nights
     from epipole.io.catalogues.element_sets import read_known_objects

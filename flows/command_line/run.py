@@ -12,6 +12,7 @@ import typer
 
 from epipole.flows.command_line.options import AsJson, Logs, check_night, print_json, print_lines
 from epipole.flows.prefect.server_process import Launched, launch
+from epipole.schemas.dates import LAST_NIGHTS, YESTERDAY, nights_before
 from epipole.schemas.options import Runner
 
 if TYPE_CHECKING:  # imported when the command runs
@@ -31,15 +32,30 @@ def run(
         typer.Option(metavar="FILE", help="Settings in TOML; `epipole settings` prints them all."),
     ] = None,
     night: Annotated[
-        str | None, typer.Option(metavar="DATE", help="Publish only this UTC date (YYYY-MM-DD).")
+        str | None,
+        typer.Option(
+            metavar="DATE", help=f"Publish only this UTC date: YYYY-MM-DD, or {YESTERDAY}."
+        ),
     ] = None,
     to: Annotated[
         str | None,
         typer.Option(metavar="DATE", help="With --night: every night to this one, one by one."),
     ] = None,
+    last_nights: Annotated[
+        int,
+        typer.Option(
+            min=1,
+            max=366,
+            metavar="N",
+            help=f"With --night {YESTERDAY}: the last N nights, where one has changed.",
+        ),
+    ] = LAST_NIGHTS,
     stale: Annotated[
         bool,
-        typer.Option("--stale", help="Make the nights again that `epipole nights` calls stale."),
+        typer.Option(
+            "--stale",
+            help="Make the nights again that `epipole nights` calls stale, or whose logs changed.",
+        ),
     ] = False,
     again: Annotated[
         bool, typer.Option("--again", help="Make a night again even if nothing has changed.")
@@ -84,21 +100,18 @@ def run(
     """
     if not verbose:
         warnings.simplefilter("ignore")
-    check_night(night)
-    early = _early_server(out, night, again)
+    dates = _dates(night, to, last_nights)
+    early = _early_server(out, dates[-1], again)
     from epipole.flows.command_line.run_nightly import Nights, RunOptions
 
     options = RunOptions(
         settings, replace, known, again, runner, workers, scheduler, quiet, verbose
     )
     nights = Nights(logs, out, options, early)
-    dates = _dates(night, to)
-    if stale:
-        dates = nights.stale()
-    if to is None and not stale:
-        (ended,) = nights.run(dates)
+    if len(dates) == 1 and to is None and not stale:
+        (ended,) = nights.run(dates, alone=True)
         _print_one(ended, quiet, as_json)
-    elif _print_each(nights.run(dates), quiet, as_json):
+    elif _print_each(nights.run(nights.stale() if stale else dates), quiet, as_json):
         raise typer.Exit(1)
 
 
@@ -110,8 +123,11 @@ def _early_server(out: str, night: str | None, again: bool) -> Launched | None:
     return launch({}) if again or not any(Path(out).glob(pattern)) else None
 
 
-def _dates(night: str | None, to: str | None) -> Sequence[str | None]:
-    """Return the nights that are asked for; None: every night of the logs."""
+def _dates(night: str | None, to: str | None, last_nights: int) -> Sequence[str | None]:
+    """Return the nights that are asked for, in order; None: every night of the logs."""
+    if night == YESTERDAY and to is None:
+        return nights_before(datetime.datetime.now(datetime.UTC).date().isoformat(), last_nights)
+    check_night(night)
     if to is None:
         return [night]
     check_night(to, "--to")

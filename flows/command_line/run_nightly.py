@@ -3,7 +3,7 @@
 import contextlib
 import logging
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -11,7 +11,7 @@ from typing import Any
 from epipole.flows.command_line.terminal import shown
 from epipole.flows.night.log_choice import find_logs
 from epipole.flows.night.progress import compile_step, prepare
-from epipole.flows.night.recorded_nights import published_nights, unchanged_nights
+from epipole.flows.night.recorded_nights import published_night, unchanged_nights
 from epipole.flows.night.summary import Summary, summarise
 from epipole.flows.prefect.server_process import Launched, launch
 from epipole.io.caches.kernel_compiler import (
@@ -23,7 +23,7 @@ from epipole.io.caches.kernel_compiler import (
 from epipole.io.caches.kernels import kernel_folder
 from epipole.io.catalogues.element_sets import read_known_objects
 from epipole.io.catalogues.star_catalogue import check_star_catalogue
-from epipole.io.datasets.dataset import check_folder, night_location
+from epipole.io.datasets.dataset import check_folder, night_location, nights_in
 from epipole.io.logs.listing import list_logs
 from epipole.io.settings_file import read_settings
 from epipole.schemas.errors import EpipoleError, NoFramesError
@@ -106,11 +106,12 @@ class Nights:
         self._known_key = known.sha256 if known else None
         for where in logs:
             list_logs(where)
+        self._logged: dict[str, tuple[int, int] | None] = {}
 
-    def run(self, nights: Sequence[str | None]) -> Iterator[Ended]:
+    def run(self, nights: Iterable[str | None], alone: bool = False) -> Iterator[Ended]:
         """Run the flow for each night, and yield how it ended.
 
-        A night that fails does not stop those after it; the only one raises its error.
+        A night that fails does not stop those after it; the only one (`alone`) raises its error.
         """
         options = self._options
         with shown(options.quiet, options.verbose), contextlib.ExitStack() as started:
@@ -124,21 +125,27 @@ class Nights:
                         make = make or self._start(started)
                         summary = make(night)
                 except EpipoleError as failed:
-                    if len(nights) == 1:
+                    if alone:
                         raise
                     error = None if isinstance(failed, NoFramesError) else str(failed)
                 yield Ended(night, summary, time.monotonic() - begun, error)
 
-    def stale(self) -> list[str]:
-        """Return the published nights that a run with these settings would make otherwise."""
-        nights = published_nights(self._out, self._settings, self._known_key)
-        return [night.date for night in nights if night.stale]
+    def stale(self) -> Iterator[str]:
+        """Yield the published nights that a run of these logs and settings would make otherwise.
+
+        Each is judged when those before it are made: it may depend on them.
+        """
+        given = find_logs(self._logs, None, self._logged)
+        for date in nights_in(self._out):
+            night = published_night(self._out, date, self._settings, self._known_key, given)
+            if night.stale:
+                yield night.date
 
     def _unchanged(self, night: str | None) -> Summary | None:
         """Return the summary of what need not be made again. This needs no Prefect."""
         if self._options.again:
             return None
-        given = find_logs(self._logs, night)
+        given = find_logs(self._logs, night, self._logged)
         same = unchanged_nights(self._out, given, night, self._settings, self._known_key)
         locations = {date: night_location(self._out, date) for date in same}
         return summarise(self._out, locations, unchanged=True) if same else None

@@ -11,6 +11,7 @@ from pydantic import Field
 
 from epipole.io.logs.listing import list_logs
 from epipole.io.logs.logged_times import read_log_times
+from epipole.schemas.dates import YESTERDAY, nights_before
 from epipole.schemas.errors import EpipoleError, LogError, NoFramesError
 from epipole.schemas.rejects import Reason, reject_rows
 from epipole.schemas.spans import DAY_NS, SPAN_NS
@@ -43,7 +44,11 @@ class FoundLogs(NamedTuple):
         return [p for p in self.paths if p not in logged or _touches(logged[p], night)]
 
 
-def find_logs(where: str | Sequence[str], night: str | None) -> FoundLogs:
+def find_logs(
+    where: str | Sequence[str],
+    night: str | None,
+    logged: dict[str, tuple[int, int] | None] | None = None,
+) -> FoundLogs:
     """Return the logs that may have frames of a night or of a margin before and after it.
 
     Parameters
@@ -52,6 +57,8 @@ def find_logs(where: str | Sequence[str], night: str | None) -> FoundLogs:
         A file, folder, glob or URL, or several; see `list_logs`. A log listed twice counts once.
     night
         UTC date, ``YYYY-MM-DD``; None: all logs.
+    logged
+        What `read_log_times` has returned by path; filled, for the next night of the same logs.
 
     Raises
     ------
@@ -72,15 +79,17 @@ def find_logs(where: str | Sequence[str], night: str | None) -> FoundLogs:
     known_ns: dict[str, tuple[int, int]] = {}
     spans: list[tuple[int, int]] = []
     broken: list[str] = []
+    logged = {} if logged is None else logged
     for path, is_named in _listed(named).items():
         try:
-            logged_ns = read_log_times(path)
+            logged_ns = logged[path] if path in logged else read_log_times(path)
         except LogError as error:
             if is_named or error.__cause__ is not None:  # it may be a log that cannot be read
                 raise
             LOGGER.warning("left out: %s", error)
             broken.append(path)
             continue
+        logged[path] = logged_ns
         if not is_named and logged_ns is not None:
             known_ns[path] = logged_ns
         if is_named or night is None or logged_ns is None or _touches(logged_ns, night):
@@ -148,10 +157,10 @@ def _date(time_ns: int) -> str:
 
 # The night that a run is asked for; Prefect checks it before it creates a run.
 
-YESTERDAY = "yesterday"
 LONGEST_NAME = 60  # of a log in a run's name
 
 Night = Annotated[str | None, Field(pattern=rf"^(\d{{4}}-\d\d-\d\d|{YESTERDAY})$")]
+LastNights = Annotated[int, Field(ge=1, le=366)]
 
 
 def night_asked(night: str | None) -> str | None:
@@ -170,7 +179,7 @@ def night_asked(night: str | None) -> str | None:
         from prefect.runtime import flow_run  # not above: an unchanged night needs no Prefect
 
         due: datetime.datetime = flow_run.scheduled_start_time
-        return (due.astimezone(datetime.UTC).date() - datetime.timedelta(days=1)).isoformat()
+        return nights_before(due.astimezone(datetime.UTC).date().isoformat(), 1)[0]
     try:
         return datetime.date.fromisoformat(night).isoformat()
     except ValueError as error:

@@ -218,22 +218,31 @@ def published_nights(dataset: str, settings: Settings, known: str | None) -> lis
         Digest of the catalogue of known objects that a run would have. None: whatever each night
         was made with.
     """
-    return [_published(dataset, date, settings, known) for date in nights_in(dataset)]
+    return [published_night(dataset, date, settings, known) for date in nights_in(dataset)]
 
 
-def _published(dataset: str, date: str, settings: Settings, known: str | None) -> PublishedNight:
+def published_night(
+    dataset: str, date: str, settings: Settings, known: str | None, given: FoundLogs | None = None
+) -> PublishedNight:
+    """Return a night as `published_nights` does; with the logs of a run they are compared too.
+
+    A night of which a log is not among these cannot be made: its logs are not compared.
+    """
     try:
         missing = missing_tables(dataset, date)
         row = night_row(dataset, date)
+        made = None if given is None or row is None else made_from(dataset, date, given)
     except DatasetError as error:
         return PublishedNight(date, {}, [str(error)])
     if row is None:
         return PublishedNight(date, {}, ["an older version"])
-    made_from = recipe_in(row)
+    made_with = recipe_in(row)
     today = recipe_of(row["logs_key"], settings, known or row["known_key"])
     stale = [
-        text for name, text in _DIFFERS.items() if getattr(made_from, name) != getattr(today, name)
+        text for name, text in _DIFFERS.items() if getattr(made_with, name) != getattr(today, name)
     ]
+    if given and made and night_logs_key(given, date, *made) != row["logs_key"]:
+        stale.append("other logs")
     if row["earlier_key"] != EarlierNights(dataset, {}).key(date, settings):
         stale.append("another night before")
     return PublishedNight(date, row, stale + [f"no table {name}" for name in missing])
@@ -341,7 +350,7 @@ def unchanged_nights(
             for date, row in rows.items()
             if recipe_in(row) == recipe_of(row["logs_key"], settings, known)
         }
-        logs = {date: made for date in made_so if (made := _made_from(dataset, date, given))}
+        logs = {date: made for date in made_so if (made := made_from(dataset, date, given))}
         same = [
             date
             for date, (names, empty) in logs.items()
@@ -374,7 +383,7 @@ class MadeFrom(NamedTuple):
     empty: set[tuple[str, int]]
 
 
-def _made_from(dataset: str, night: str, given: FoundLogs) -> MadeFrom | None:
+def made_from(dataset: str, night: str, given: FoundLogs) -> MadeFrom | None:
     """Return which logs a night was made from; None where they are not among those given.
 
     A second copy of a log is not in the sources.

@@ -79,6 +79,7 @@ class Summary:
     unchanged: bool
     by_sensor: list[SensorSummary]
     extracts: tuple[ReportExtract, ...]  # of the nights' reports, for Prefect's page
+    earlier: tuple[str, ...] = ()  # what became of nights before these that were made too
 
     def as_dict(self) -> dict[str, Any]:
         """Return the counts by name, as JSON takes them."""
@@ -109,7 +110,7 @@ class Summary:
     def sentence(self) -> str:
         """Return what was found as one line, with what needs a look."""
         if self.unchanged:
-            return f"unchanged: {', '.join(self.nights)}"
+            return "; ".join([f"unchanged: {', '.join(self.nights)}", *self.earlier])
         parts = [
             many(self.objects, "object"),
             many(self.positions, "position"),
@@ -121,7 +122,7 @@ class Summary:
             parts.append(f"{many(len(self.faults), 'sensor')} at fault")
         if self.rejects:
             parts.append(f"{sum(self.rejects.values()):,} left out")
-        return ", ".join(parts)
+        return "; ".join([", ".join(parts), *self.earlier])
 
     def doubtful(self) -> dict[str, int]:
         """Return how many objects are not sound, by verdict."""
@@ -226,6 +227,7 @@ def summarise(dataset: str, nights: Mapping[str, Where], unchanged: bool = False
             for name in sorted(pc.unique(frames["sensor_id"]).to_pylist())
         ],
         extracts=(),
+        earlier=(),
     )
 
 

@@ -125,6 +125,7 @@ def as_markdown(summary: Summary) -> str:
     # No link: browsers open neither files nor buckets from a page.
     lines += ["Tables:", "", *(f"- {as_markdown_text(path)}" for path in _table_paths(summary))]
     for heading, sentences in (
+        ("Nights before:", summary.earlier),
         ("Mistakes in the logs:", summary.mistakes),
         ("Sensors at fault:", summary.faults),
     ):

@@ -5,7 +5,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from typer.testing import CliRunner
 
+from epipole.flows.command_line.main import app
 from epipole.flows.night.log_choice import find_logs
 from epipole.flows.night.recorded_nights import unchanged_nights
 from epipole.flows.nightly import nightly
@@ -72,3 +74,49 @@ def test_logs_that_give_nothing_are_on_no_night_and_open_ones_on_their_own(tmp_p
     assert unchanged(folder, out, None) == list(DAYS)
     shutil.copy(folder / "second.mcap", folder / "z.mcap")
     assert unchanged(folder, out, None) == list(DAYS)  # a copy adds nothing
+
+
+def test_late_logs_make_their_nights_again_in_order(tmp_path, monkeypatch, no_early_server):
+    folder, out = tmp_path / "logs", tmp_path / "out"
+    folder.mkdir()
+    write_log(folder / "second.mcap", DAYS[1])
+
+    def morning():
+        with monkeypatch.context() as patched:
+            patched.setattr("epipole.flows.nightly.night_asked", lambda night: DAYS[1])
+            return nightly(str(folder), str(out), PLAIN, night="yesterday")
+
+    assert morning().earlier == ()  # there is no log of the day before
+    write_log(folder / "first.mcap", DAYS[0])
+    late = morning()
+    assert [sentence[:16] for sentence in late.earlier] == [f"{DAYS[0]} made:"]
+    assert not late.unchanged  # the night before is another one
+    again = morning()
+    assert again.unchanged
+    assert again.earlier == ()
+
+    write_log(folder / "more.mcap", DAYS[0], 15)
+    settings = tmp_path / "settings.toml"
+    settings.write_text("[report]\nwrite = false\n")
+    asked = ["run", str(folder), "--out", str(out), "--settings", str(settings)]
+    ended = CliRunner().invoke(app, [*asked, "--stale"])
+    assert [line[:10] for line in ended.stdout.splitlines()] == [*DAYS, "2 made"]
+    ended = CliRunner().invoke(app, [*asked, "--stale"])
+    assert ended.stdout.splitlines() == ["no night"]
+    ended = CliRunner().invoke(app, [*asked, "--night", "yesterday", "--last-nights", "2"])
+    assert ended.stdout.splitlines()[-1] == "2 without frames"
+
+
+def test_what_is_wrong_with_a_night_before_does_not_stop_the_one_asked_for(tmp_path, monkeypatch):
+    folder, out = tmp_path / "logs", tmp_path / "out"
+    folder.mkdir()
+    for day in DAYS:
+        write_log(folder / f"{day}.mcap", day)
+        nightly(str(folder), str(out), PLAIN, night=day)
+    (folder / f"{DAYS[0]}.mcap").unlink()
+    write_log(folder / "other.mcap", DAYS[0], 3)
+    monkeypatch.setattr("epipole.flows.nightly.waiting_nights", lambda: {DAYS[0], "2019-05-01"})
+    summary = nightly(str(folder), str(out), PLAIN, night=DAYS[1])
+    assert summary.unchanged
+    (sentence,) = summary.earlier
+    assert f"was also made from {DAYS[0]}.mcap" in sentence
