@@ -1,22 +1,25 @@
-"""The report of a night of a dataset, as one HTML file."""
+"""The report of a night of a dataset, or the calendar of its nights, as one HTML file."""
 
 import os
 import tempfile
 from pathlib import Path
+from urllib.parse import quote
 
 from epipole.flows.night.reports import night_facts
-from epipole.io.datasets.dataset import nights_in
-from epipole.io.paths import fault_of_name
+from epipole.io.datasets.dataset import night_row, nights_in
+from epipole.io.paths import fault_of_name, file_system, storage_errors
 from epipole.schemas.errors import DatasetError, ReportError
 
+HEAD = 4096  # bytes of a page that have its verdict
 
-def report(dataset: str, night: str, out: Path) -> int:
-    """Write the report of a night, and return its size in bytes.
+
+def report(dataset: str, night: str | None, out: Path) -> int:
+    """Write the report of a night, or of None the calendar; return its size in bytes.
 
     Raises
     ------
     DatasetError
-        Where the night does not exist or cannot be read.
+        Where the night, or any night, does not exist or cannot be read.
     ReportError
         Where matplotlib is missing, or the file cannot be written.
     """
@@ -25,12 +28,50 @@ def report(dataset: str, night: str, out: Path) -> int:
     if out.is_dir():
         raise ReportError(f"{out}: is a folder; give the name of a file, such as {out}/night.html")
     nights = nights_in(dataset)
+    if night is None:
+        return _write(out, _calendar(dataset, nights, out).encode())
     if night not in nights:
         raise DatasetError(f"{dataset}: has no night {night}")
     # Without matplotlib this module cannot be imported: it raises `ReportError`.
     from epipole.tasks.report.page import night_page
 
     return _write(out, night_page(night_facts(dataset, night, nights)).encode())
+
+
+def _calendar(dataset: str, nights: list[str], out: Path) -> str:
+    from epipole.tasks.report.calendar import CalendarNight, calendar_page
+    from epipole.tasks.report.html import VERDICT
+
+    if not nights:
+        raise DatasetError(f"{dataset}: has no night")
+    found = []
+    for night in nights:
+        try:
+            row = night_row(dataset, night)
+        except DatasetError:
+            row = None
+        page = f"{dataset.rstrip('/')}/reports/{night}.html"
+        said = VERDICT.search(_head_of(page))
+        address = _address(page, out) if said else ""
+        found.append(CalendarNight(night, row, said[1] if said else "", address))
+    return calendar_page(dataset, found)
+
+
+def _head_of(page: str) -> str:
+    """Return the beginning of a page; '' where it is missing."""
+    try:
+        storage, path = file_system(page)
+        with storage.open(path, "rb") as file:
+            return str(file.read(HEAD).decode("utf-8", "replace"))
+    except storage_errors():
+        return ""
+
+
+def _address(page: str, out: Path) -> str:
+    if "://" in page:
+        return page
+    relative = os.path.relpath(page, out.parent)
+    return quote(Path(relative).as_posix())
 
 
 def _write(out: Path, data: bytes) -> int:

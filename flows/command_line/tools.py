@@ -30,17 +30,26 @@ def report(
         str,
         typer.Argument(metavar="DATASET", help="Folder or URL that `epipole run` published to."),
     ],
-    night: Annotated[str, typer.Option(metavar="DATE", help="The night, a UTC date (YYYY-MM-DD).")],
     out: Annotated[Path, typer.Option(metavar="FILE", help="HTML file to write.")],
+    night: Annotated[
+        str | None,
+        typer.Option(
+            metavar="DATE",
+            help="The night, a UTC date (YYYY-MM-DD); default: a calendar of all nights.",
+        ),
+    ] = None,
     as_json: AsJson = False,
 ) -> None:
     """Write the report of a night: one HTML file with pictures, which needs no other file.
 
-    It needs the extra `report` (matplotlib).
+    Without --night, a calendar of the nights, coloured by what is to be thought of them.
+
+    A night needs the extra `report` (matplotlib).
     """
     from epipole.flows.report import report
 
-    check_night(night)
+    if night is not None:
+        check_night(night)
     size = report(dataset, night, out)
     if as_json:
         print_json({"file": str(out), "bytes": size})

@@ -5,13 +5,15 @@ Its options are of the process too: they are set only while a picture is drawn, 
 """
 
 import contextlib
+import json
 import logging
 import re
 import threading
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from io import BytesIO  # type: ignore[attr-defined]  # mypy takes the folder io/ for it
 from typing import Any
+from xml.etree import ElementTree
 
 import numpy as np
 import numpy.typing as npt
@@ -23,6 +25,7 @@ from epipole.schemas.text import as_line
 logging.getLogger("matplotlib").setLevel(logging.ERROR)
 try:
     import matplotlib as mpl
+    from matplotlib.artist import Artist
     from matplotlib.axes import Axes
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.backends.backend_svg import FigureCanvasSVG
@@ -43,7 +46,7 @@ LINES = (
     (ORANGE, "v", "-"), (SKY, "P", "--"), (BLACK, "X", "-."), (GREY, "*", ":"),
 )  # fmt: skip
 WIDTH_IN = 3.7  # a phone is so wide: text in a picture is as large as beside it
-LONGEST_NAME = 18
+LONGEST_NAME, LONGEST_TEXT = 18, 300
 _OPTIONS: dict[Any, Any] = {
     "axes.edgecolor": GREY,
     "axes.labelcolor": INK,
@@ -74,9 +77,6 @@ _OPTIONS: dict[Any, Any] = {
 _NO_TIMES = {"Date": None, "Creator": None, "Format": None, "Type": None}
 _ALONE = threading.Lock()
 PNG_DPI = 110
-_METADATA = re.compile(r"<metadata>.*?</metadata>\s*", re.DOTALL)
-_LINE_START = re.compile(r"\n\s*")
-_ATTRIBUTE = re.compile(r'="[^"]*"')
 _LONG_NUMBER = re.compile(r"-?\d+\.\d{3,}")  # a hundredth of a point is seen by nobody
 
 Draw = Callable[[Figure], None]
@@ -87,11 +87,128 @@ def as_svg(draw: Draw, height_in: float, width_in: float = WIDTH_IN) -> str:
     out: Any = BytesIO()
     with _drawn(draw, width_in, height_in) as figure:
         FigureCanvasSVG(figure).print_svg(out, metadata=_NO_TIMES)
-    text: str = out.getvalue().decode()
-    text = _METADATA.sub("", text[text.index("<svg") :])
-    text = _ATTRIBUTE.sub(lambda match: _LONG_NUMBER.sub(_rounded, match[0]), text)
-    text = _LINE_START.sub("\n", text)
-    return text.replace("'DejaVu Sans'", "'DejaVu Sans', Verdana, sans-serif")
+    # matplotlib wrote it: it has no entities but those of XML.
+    root = ElementTree.fromstring(out.getvalue())
+    _for_page(root)
+    zoomed = [axes for axes in figure.axes if (axes.get_gid() or "").startswith(_ZOOM)]
+    if zoomed:
+        _tell_axes(root, figure, zoomed[0])
+    made: str = ElementTree.tostring(root, encoding="unicode")
+    return made
+
+
+# What page.js needs: dots with a text (`data-t`) and a link (`data-h`), what is data and what are
+# axes (classes), and the values at the sides of the axes.
+
+SVG, XLINK = "http://www.w3.org/2000/svg", "http://www.w3.org/1999/xlink"
+ElementTree.register_namespace("", SVG)
+ElementTree.register_namespace("xlink", XLINK)
+_HOVER, _ZOOM = "hover:", "zoom:"  # how the names of groups begin
+_CLASSES = {"matplotlib.axis_1": "xaxis", "matplotlib.axis_2": "yaxis"}
+_TICK = ("xtick_", "ytick_")
+_DATA = ("PathCollection_", "LineCollection_", "line2d_", "Quiver_", "text_", "data", _HOVER)
+# Colours of a picture follow those of the page, dark or light.
+COLOURS = {
+    INK: "ink", GREY: "grey", PALE: "pale", "#e3e7ea": "grid", "#ffffff": "paper",
+    BLACK: "black", ORANGE: "orange", SKY: "sky", GREEN: "green", YELLOW: "yellow", BLUE: "blue",
+    VERMILLION: "vermillion", PURPLE: "purple",
+}  # fmt: skip
+_VARIABLES = {colour.lower(): f"var(--{name})" for colour, name in COLOURS.items()}
+_COLOUR = re.compile(r"#[0-9a-f]{6}")
+_FONT = re.compile(r"font-family: [^;]*; ?")  # that of the page
+
+
+def hover(artist: Artist, texts: Sequence[str], links: Sequence[str] = ()) -> None:
+    """Give each dot of an artist a text that the page shows beside it, and where it leads to."""
+    shown = [as_line(each, LONGEST_TEXT) for each in texts]
+    artist.set_gid(_HOVER + json.dumps([shown, list(links)]))
+
+
+def zoomable(axes: Axes, kind: str = "number") -> None:
+    """Let the page zoom into these axes; `kind` of the x axis: number, ra (mod 360) or time."""
+    axes.set_gid(_ZOOM + kind)
+
+
+def _for_page(root: ElementTree.Element) -> None:
+    """Make a picture part of a page, as it is: no ids or styles that others could have too."""
+    for parent in list(root.iter()):
+        for child in list(parent):
+            parent.text = parent.text and parent.text.strip()
+            child.tail = None
+            if child.tag in (f"{{{SVG}}}metadata", f"{{{SVG}}}style"):
+                parent.remove(child)
+        name = parent.get("id", "")
+        if parent.tag == f"{{{SVG}}}g" and name:
+            _name_group(parent, name)
+        for key, value in parent.items():
+            if key not in ("id", "data-t"):
+                shorter = _FONT.sub("", _COLOUR.sub(_variable, value))
+                parent.set(key, _LONG_NUMBER.sub(_rounded, shorter))
+        if parent.get("transform", "").startswith("rotate(-0 "):
+            del parent.attrib["transform"]
+    for group in root.iter(f"{{{SVG}}}g"):
+        _share_style(group)
+    for key in ("width", "height", "version"):
+        root.attrib.pop(key, None)
+
+
+def _share_style(group: ElementTree.Element) -> None:
+    """Give the style that all parts of a group have to the group."""
+    styles = {child.get("style") for child in group if child.tag != f"{{{SVG}}}defs"}
+    if len(styles) == 1 and len(group) > 1 and not group.get("style"):
+        style = styles.pop()
+        if style and "clip-path" not in style:
+            group.set("style", style)
+            for child in group:
+                child.attrib.pop("style", None)
+
+
+def _name_group(group: ElementTree.Element, name: str) -> None:
+    del group.attrib["id"]
+    if name in _CLASSES:
+        group.set("class", _CLASSES[name])
+    elif name.startswith(_TICK):
+        group.set("class", "tick")
+    elif name.startswith(_ZOOM):
+        for child in group:
+            if child.get("id", "").startswith(_DATA):
+                child.set("class", "data")
+        group.set("class", "zoom")
+    elif name.startswith(_HOVER):
+        texts, links = json.loads(name.removeprefix(_HOVER))
+        dots = [each for each in _outside_definitions(group) if _is_dot(each)]
+        if len(dots) == len(texts):
+            for k, dot in enumerate(dots):
+                if texts[k]:
+                    dot.set("data-t", texts[k])
+                if links and links[k]:
+                    dot.set("data-h", links[k])
+
+
+def _outside_definitions(group: ElementTree.Element) -> Iterator[ElementTree.Element]:
+    for child in group:
+        if child.tag != f"{{{SVG}}}defs":
+            yield child
+            yield from _outside_definitions(child)
+
+
+def _is_dot(element: ElementTree.Element) -> bool:
+    return element.tag in (f"{{{SVG}}}use", f"{{{SVG}}}path")
+
+
+def _variable(colour: re.Match[str]) -> str:
+    return _VARIABLES.get(colour[0], colour[0])
+
+
+def _tell_axes(root: ElementTree.Element, figure: Figure, axes: Axes) -> None:
+    """Say where the axes are in the picture [pt], and which values their sides have."""
+    width, height = (72 * float(inches) for inches in figure.get_size_inches())
+    at = axes.get_position()
+    box = (at.x0 * width, (1 - at.y1) * height, at.width * width, at.height * height)
+    (left, right), (bottom, top) = axes.get_xlim(), axes.get_ylim()
+    for name, values in (("box", box), ("x", (left, right)), ("y", (top, bottom))):
+        root.set(f"data-{name}", " ".join(f"{value:.6g}" for value in values))
+    root.set("data-kind", str(axes.get_gid()).removeprefix(_ZOOM))
 
 
 def as_png(draw: Draw, height_in: float, width_in: float = WIDTH_IN) -> bytes:
@@ -167,11 +284,17 @@ def time_axis(axes: Axes, first_s: float, last_s: float) -> None:
     """Make the x axis a clock, from seconds of the day."""
     length = max(last_s - first_s, 1.0)
     first_s, last_s = first_s - 0.01 * length, last_s + 0.01 * length
-    step = next((s for s in _STEPS if length / s <= 4.5), _STEPS[-1])
+    axes.set_xticks(*clock_ticks(first_s, last_s))
+    axes.set(xlim=(first_s, last_s), xlabel="time, UTC")
+
+
+def clock_ticks(first_s: float, last_s: float) -> tuple[list[int], list[str]]:
+    """Return a few round times between two, in seconds of the day, and what they are called."""
+    length = max(last_s - first_s, 1.0)
+    step = next((s for s in _STEPS if length / s <= 4.6), _STEPS[-1])
     start = int(-(-first_s // step))
     ticks = [k * step for k in range(start, int(last_s // step) + 1)]
-    axes.set_xticks(ticks, [_clock(t, with_seconds=step < 60) for t in ticks])
-    axes.set(xlim=(first_s, last_s), xlabel="time, UTC")
+    return ticks, [_clock(t, with_seconds=step < 60) for t in ticks]
 
 
 def _clock(seconds: int, with_seconds: bool) -> str:

@@ -1,6 +1,6 @@
 """Pictures of sensors: one frame, residuals, epipolar lines; and their night in curves."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 import numpy.typing as npt
@@ -19,12 +19,14 @@ from epipole.tasks.report.canvas import (
     VERMILLION,
     as_image,
     axes_of,
+    hover,
     legend_below,
     short,
     time_axis,
+    zoomable,
 )
 from epipole.tasks.report.epipolar_views import EpipolarViews
-from epipole.tasks.report.frame_series import FrameSeries
+from epipole.tasks.report.frame_series import FrameSeries, clock
 from epipole.tasks.report.stars import CELLS, StarMap, StarResiduals
 
 # In the image of a sensor.
@@ -45,26 +47,24 @@ def draw_star_map(figure: Figure, frame: StarMap, size_px: Array) -> None:
     axes = axes_of(figure)
     x, y = frame.stars_px.T
     area = 3.0 + 2.5 * np.clip(frame.magnitude.max(initial=0.0) - frame.magnitude, 0, 12)
-    axes.scatter(x, y, s=area, color=BLACK, linewidths=0, zorder=3, label="star, size by magnitude")
+    stars = axes.scatter(x, y, s=area, color=BLACK, linewidths=0, zorder=3,
+                         label="star, size by magnitude")  # fmt: skip
+    hover(stars, frame.says)
+    zoomable(axes)
     axes.scatter(x, y, s=area + 34, facecolors="none", edgecolors=BLUE, linewidths=0.9,
                  label="identified")  # fmt: skip
     scale = vector_scale(frame.residuals_px, size_px)
     _vectors(axes, frame.stars_px, frame.residuals_px, scale, VERMILLION)
     tracked, lone = frame.others_px[frame.objects], frame.others_px[~frame.objects]
     area, width = (26.0, 1.2) if len(tracked) <= CROWD else (9.0, 0.7)
-    axes.scatter(
+    marks = axes.scatter(
         tracked[:, 0], tracked[:, 1], s=area, marker="s", facecolors="none", edgecolors=ORANGE,
         linewidths=width, label="object (has a track)",
     )  # fmt: skip
-    axes.scatter(
-        lone[:, 0],
-        lone[:, 1],
-        s=13,
-        marker="x",
-        color=GREY,
-        linewidths=0.8,
-        label="other detection",
-    )
+    hover(marks, [frame.others_say[k] for k in np.flatnonzero(frame.objects)])
+    marks = axes.scatter(lone[:, 0], lone[:, 1], s=13, marker="x", color=GREY, linewidths=0.8,
+                         label="other detection")  # fmt: skip
+    hover(marks, [frame.others_say[k] for k in np.flatnonzero(~frame.objects)])
     for k, (dx, dy, how) in _label_positions(frame, size_px, scale).items():
         axes.annotate(str(frame.star_id[k]), frame.stars_px[k], (dx, dy), fontsize=6.5,
                       textcoords="offset points", ha=how, va="center", color=BLUE)  # fmt: skip
@@ -147,36 +147,55 @@ def image_pattern(residuals: StarResiduals, k: int) -> tuple[Array, npt.NDArray[
     return mean, surely
 
 
-def draw_epipolar(figure: Figure, views: EpipolarViews) -> None:
-    """Draw the lines of one sensor's lines of sight in the image of another."""
+def draw_epipolar(figure: Figure, views: EpipolarViews, anchors: Mapping[str, str]) -> None:
+    """Draw the lines of one sensor's lines of sight in the image of another.
+
+    `anchors` are where on the page objects are shown more closely, by id.
+    """
     axes = axes_of(figure)
+    zoomable(axes)
     others = _other_than(views)
     if len(others):
         x, y = others.T
         axes.scatter(x, y, s=10, marker="x", color=GREY, linewidths=0.7,
                      label="other detections")  # fmt: skip
+    ends: list[float] = []
     for number, line in enumerate(views.lines):
         colour, _, dashes = LINES[number % len(LINES)]
         names = {"line": f"line of sight of {short(views.from_sensor, 12)}",
                  "seen": f"object, seen by {short(views.in_sensor, 12)}"}  # fmt: skip
         axes.plot(*line.line_px.T, color=colour, linestyle=dashes, linewidth=1.0,
                   label=None if number else names["line"])  # fmt: skip
-        axes.plot(*line.seen_px, marker="o", markersize=6, markerfacecolor="none", linestyle="",
-                  markeredgecolor=colour, markeredgewidth=1.3,
-                  label=None if number else names["seen"])  # fmt: skip
-        for at, offset, how in ((line.seen_px, (5, 6), "left"), _line_end(line.line_px)):
+        (ring,) = axes.plot(
+            *line.seen_px, marker="o", markersize=6, markerfacecolor="none", linestyle="",
+            markeredgecolor=colour, markeredgewidth=1.3, label=None if number else names["seen"],
+        )  # fmt: skip
+        hover(ring, [f"{number + 1}, {line.object_id}: seen by {views.in_sensor} at "
+                     f"{clock(views.epoch_ns)}, {line.distance_px:.2f} px from its line"],
+              [anchors.get(line.object_id, "")])  # fmt: skip
+        numbers_px = [(line.seen_px, (5, 6)), *_line_end(line.line_px, ends, views.size_px)]
+        for at, offset in numbers_px:
             axes.annotate(f"{number + 1}", (at[0], at[1]), offset, textcoords="offset points",
-                          fontsize=7, ha=how, va="center", color=colour,
+                          fontsize=7, va="center", color=colour,
                           annotation_clip=False)  # fmt: skip
     as_image(axes, views.size_px)
     legend_below(figure, axes, columns=2)
 
 
-def _line_end(line_px: Array) -> tuple[Array, tuple[int, int], str]:
-    """Return where the number of a line stands: beyond its right end."""
+def _line_end(
+    line_px: Array, taken: list[float], size_px: Array
+) -> list[tuple[Array, tuple[int, int]]]:
+    """Return where the number of a line stands: beyond its right end, where there is room.
+
+    `taken` are the rows of those that stand there.
+    """
     if not len(line_px):
-        return np.full(2, np.nan), (0, 0), "left"
-    return line_px[np.argmax(line_px[:, 0])], (10, 0), "left"
+        return []
+    end = line_px[np.argmax(line_px[:, 0])]
+    if any(abs(end[1] - row) < 0.03 * size_px[1] for row in taken):
+        return []
+    taken.append(float(end[1]))
+    return [(end, (10, 0))]
 
 
 def _other_than(views: EpipolarViews) -> Array:
@@ -192,6 +211,7 @@ MAX_ROWS = 16
 MAX_LINES = len(LINES)
 ROW_IN = 0.3
 MARKERS = 6  # on a line
+MAX_HOVERED = 48  # bins of a line that say what they are
 # How frames got their attitude: colour, hatch, name.
 KINDS = (
     (BLUE, "", "identified"), (ORANGE, "////", "predicted"), (VERMILLION, "xxxx", "no attitude"),
@@ -262,6 +282,10 @@ def draw_series(figure: Figure, series: FrameSeries, what: str, ylabel: str) -> 
         axes.plot(middle, values[k], color=colour, marker=marker, linestyle=dashes, linewidth=1.0,
                   markersize=3.5, markevery=(number % every, every),
                   label=short(series.sensors[k], 12))  # fmt: skip
+        shown = np.flatnonzero(np.isfinite(values[k]))[:: -(-len(middle) // MAX_HOVERED)]
+        dots = axes.scatter(middle[shown], values[k][shown], s=30, alpha=0)
+        hover(dots, [f"{series.sensors[k]} at {clock(int(middle[i] * 1e9))}: {values[k][i]:.3g}"
+                     for i in shown])  # fmt: skip
     time_axis(axes, edges[0], edges[-1])
     known = values[np.isfinite(values)]
     if len(known) and known.min() > 0 and known.max() / known.min() > 20:

@@ -1,6 +1,6 @@
 """Pictures of the sky and of distributions: tracklets, objects; found against expected."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -22,7 +22,9 @@ from epipole.tasks.report.canvas import (
     SKY,
     VERMILLION,
     axes_of,
+    hover,
     legend_below,
+    zoomable,
 )
 from epipole.tasks.report.draw_sensors import night_axis
 from epipole.tasks.report.objects import NightNumbers, NightObject, SkyTracks
@@ -51,22 +53,28 @@ _STATUSES = {
 FAR_KM = 20_000.0
 
 
-def draw_sky(figure: Figure, tracks: SkyTracks) -> None:
-    """Draw tracklets in right ascension and declination: their end has the marker."""
+def draw_sky(figure: Figure, tracks: SkyTracks, anchors: Mapping[str, str]) -> None:
+    """Draw tracklets in right ascension and declination: their end has the marker.
+
+    `anchors` are where on the page objects are shown more closely, by id.
+    """
     axes = axes_of(figure, "right ascension [deg]", "declination [deg]")
+    zoomable(axes, "ra")
     radec_deg = np.concatenate([line.radec_deg for line in tracks.lines])
     middle = np.radians(radec_deg[:, 0])
     centre = np.degrees(np.arctan2(np.sin(middle).mean(), np.cos(middle).mean())) % 360
     for outcome, (colour, dashes, marker) in _OUTCOMES.items():
-        of_outcome = [line.radec_deg for line in tracks.lines if line.outcome == outcome]
+        of_outcome = [line for line in tracks.lines if line.outcome == outcome]
         if not of_outcome:
             continue
-        lines = [_whole(line, centre) for line in of_outcome]
+        lines = [_whole(line.radec_deg, centre) for line in of_outcome]
         x, y = np.concatenate([np.vstack([line, [np.nan, np.nan]]) for line in lines]).T
         axes.plot(x, y, color=colour, linestyle=dashes, linewidth=0.9)
         ends = np.array([line[-1] for line in lines])
-        axes.plot(*ends.T, color=colour, linestyle="", marker=marker, markersize=3.2,
-                  label=f"{outcome} ({tracks.counts.get(outcome, 0):,})")  # fmt: skip
+        (dots,) = axes.plot(*ends.T, color=colour, linestyle="", marker=marker, markersize=3.2,
+                            label=f"{outcome} ({tracks.counts.get(outcome, 0):,})")  # fmt: skip
+        hover(dots, [line.about for line in of_outcome],
+              [anchors.get(line.object_id, "") for line in of_outcome])  # fmt: skip
     _limits(axes, radec_deg, centre)
     legend_below(figure, axes, columns=2)
 
@@ -88,18 +96,23 @@ def _limits(axes: Axes, radec_deg: Array, centre: float) -> None:
     axes.set_xlim(high + margin, low - margin)
 
 
-def draw_ring(figure: Figure, objects: Sequence[NightObject]) -> None:
+def draw_ring(figure: Figure, objects: Sequence[NightObject], anchors: Mapping[str, str]) -> None:
     """Draw objects near the geostationary ring: longitude and latitude, first to last position."""
     axes = axes_of(figure, "longitude [deg east]", "latitude [deg]")
     for status, (colour, marker) in _STATUSES.items():
-        of_status = [o.ends for o in objects if o.status == status and o.ends is not None]
+        of_status = [o for o in objects if o.status == status and o.ends is not None]
         if not of_status:
             continue
-        first, last = np.array(of_status)[:, :, :2].swapaxes(0, 1)
+        first, last = np.array([o.ends for o in of_status])[:, :, :2].swapaxes(0, 1)
         jump = np.abs(first[:, 0] - last[:, 0]) > 180
         first[jump] = last[jump]
         axes.plot(*np.stack([first, last]).transpose(2, 0, 1), color=colour, linewidth=0.9)
-        axes.plot(*last.T, **_mark(marker, colour), label=f"{status} ({len(of_status):,})")
+        (dots,) = axes.plot(
+            *last.T, **_mark(marker, colour), label=f"{status} ({len(of_status):,})"
+        )
+        hover(dots, [o.about for o in of_status],
+              [anchors.get(o.object_id, "") for o in of_status])  # fmt: skip
+    zoomable(axes)
     axes.locator_params(axis="x", nbins=5)  # more would run into each other
     axes.grid(color="#e3e7ea", linewidth=0.5)
     axes.set_axisbelow(True)
@@ -111,7 +124,9 @@ def _mark(marker: str, colour: str) -> dict[str, Any]:
             "markeredgecolor": colour, "markeredgewidth": 1.2}  # fmt: skip
 
 
-def draw_elements(figure: Figure, objects: Sequence[NightObject]) -> None:
+def draw_elements(
+    figure: Figure, objects: Sequence[NightObject], anchors: Mapping[str, str]
+) -> None:
     """Draw eccentricity and inclination of objects over their semi-major axis."""
     upper, lower = figure.subplots(2, 1, sharex=True)
     for status, (colour, marker) in _STATUSES.items():
@@ -122,8 +137,11 @@ def draw_elements(figure: Figure, objects: Sequence[NightObject]) -> None:
         sigmas = np.array([o.element_sigmas for o in of_status]).T
         for axes, y, sigma in ((upper, e, sigmas[1]), (lower, i, sigmas[2])):
             axes.errorbar(a, y, sigma, sigmas[0], fmt="none", ecolor=colour, elinewidth=0.5)
-        upper.plot(a, e, **_mark(marker, colour), label=f"{status} ({len(of_status):,})")
-        lower.plot(a, i, **_mark(marker, colour))
+        label = f"{status} ({len(of_status):,})"
+        for axes, y in ((upper, e), (lower, i)):
+            (dots,) = axes.plot(a, y, **_mark(marker, colour), label=label)
+            hover(dots, [o.about for o in of_status],
+                  [anchors.get(o.object_id, "") for o in of_status])  # fmt: skip
     upper.set(ylabel="eccentricity")
     lower.set(ylabel="inclination [deg]", xlabel="semi-major axis [thousand km]")
     a, e, i = np.array([o.elements for o in objects if o.elements is not None]).T
@@ -157,6 +175,9 @@ def draw_trend(figure: Figure, nights: Sequence[NightNumbers]) -> None:
     all_axes = figure.subplots(len(strips), 1, sharex=True)
     for (name, values), axes, (colour, marker, _) in zip(strips, all_axes, LINES, strict=False):
         axes.plot(at, values, color=colour, linewidth=1.0, marker=marker, markersize=2.8)
+        dots = axes.scatter(at, values, s=30, alpha=0)
+        hover(dots, [f"{each.night}: {' '.join(name.split())} {value:,.4g}"
+                     for each, value in zip(nights, values, strict=True)])  # fmt: skip
         axes.plot(at[-1:], values[-1:], color=colour, marker=marker, markersize=7)
         axes.set_ylabel(name, rotation=0, ha="right", va="center")
         axes.set_ylim(0, 1.15 * max(max(values), 1e-9))

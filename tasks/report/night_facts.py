@@ -12,10 +12,11 @@ import polars as pl
 
 from epipole.io.datasets.night_tables import NightReader
 from epipole.schemas.log_checks import MISTAKE_COLUMNS, mistakes
-from epipole.schemas.rejects import Reason, Trait
+from epipole.schemas.rejects import NameStatus, ObjectVerdict, Reason, Trait
 from epipole.schemas.stages import Stage
 from epipole.tasks.report.epipolar_views import OPTICS, EpipolarViews, read_epipolar_views
 from epipole.tasks.report.frame_series import FrameSeries, Gap, read_frame_series
+from epipole.tasks.report.object_details import MAX_DETAILED, ObjectDetail, read_object_details
 from epipole.tasks.report.objects import (
     NightNumbers,
     NightObject,
@@ -25,7 +26,13 @@ from epipole.tasks.report.objects import (
     read_trend,
 )
 from epipole.tasks.report.solved_chi2 import SolvedChi2, read_solved_chi2
-from epipole.tasks.report.stars import StarMap, StarResiduals, read_star_map, read_star_residuals
+from epipole.tasks.report.stars import (
+    StarMap,
+    StarResiduals,
+    read_frame_concerned,
+    read_star_map,
+    read_star_residuals,
+)
 
 # What was left out, by stage, reason and sensor.
 
@@ -74,7 +81,8 @@ _CALIBRATIONS = ["sensor_id", *OPTICS, "sigma_fx_px", "sigma_fy_px", "n_stars", 
 class NightFacts(NamedTuple):
     """What the report says. None, or empty: the night has no such rows.
 
-    `trend` ends with the night itself; `counts` are rows by table.
+    `trend` ends with the night itself; `counts` are rows by table. `concerned` are frames of
+    sensors that need a look, by sensor.
     """
 
     night: str
@@ -91,6 +99,8 @@ class NightFacts(NamedTuple):
     star_map: StarMap | None
     tracks: SkyTracks | None
     epipolar: EpipolarViews | None
+    concerned: dict[str, StarMap]
+    details: list[ObjectDetail]
     objects: list[NightObject]
     trend: list[NightNumbers]
 
@@ -100,6 +110,11 @@ class NightFacts(NamedTuple):
             return np.array([1.0, 1.0])
         size: np.ndarray = self.residuals.size_px[self.residuals.sensors.index(sensor_id)]
         return size
+
+    @property
+    def anchors(self) -> dict[str, str]:
+        """Where on the page an object is shown more closely, by its id."""
+        return {each.object_id: f"#object-{k}" for k, each in enumerate(self.details, start=1)}
 
 
 COUNTED = ("frames", "stars", "detections", "tracklets", "associations", "positions", "states",
@@ -126,6 +141,7 @@ def read_night_facts(
     if residuals is not None:
         sizes = dict(zip(residuals.sensors, residuals.size_px, strict=True))
         views = read_epipolar_views(night, calibrations, sizes)
+    objects = read_objects(night)
     return NightFacts(
         night=night.night,
         dataset=dataset,
@@ -141,9 +157,36 @@ def read_night_facts(
         star_map=None if series is None else read_star_map(night, series),
         tracks=read_sky_tracks(night),
         epipolar=views,
-        objects=read_objects(night),
+        concerned=_concerned(night, series, residuals),
+        details=read_object_details(night, [each.object_id for each in look_first(objects)]),
+        objects=objects,
         trend=read_trend([*earlier, night]),
     )
+
+
+def look_first(objects: Sequence[NightObject]) -> list[NightObject]:
+    """Return the objects that are shown more closely: unsound ones first, then unknown ones."""
+    order = sorted(objects, key=lambda each: (
+        each.verdict == ObjectVerdict.SOUND, each.status == NameStatus.KNOWN, -each.positions
+    ))  # fmt: skip
+    return order[:MAX_DETAILED]
+
+
+def _concerned(
+    night: NightReader, series: FrameSeries | None, residuals: StarResiduals | None
+) -> dict[str, StarMap]:
+    """Return a frame of each sensor whose share identified or residuals need a look."""
+    if series is None:
+        return {}
+    wrong = {series.sensors[k] for k in np.flatnonzero(series.identified_share < MIN_IDENTIFIED)}
+    if residuals is not None:
+        wrong |= {name for name, _ in _residuals_off(residuals)}
+    order = sorted(wrong, key=lambda name: series.identified_share[series.sensors.index(name)])
+    frames = {
+        name: read_frame_concerned(night, series, series.sensors.index(name))
+        for name in order[:MAX_CONCERNED]
+    }
+    return {name: frame for name, frame in frames.items() if frame is not None}
 
 
 # What needs a look, as sentences; none where all is well.
@@ -155,32 +198,41 @@ LOWEST, HIGHEST = 0.7, 1.4
 MIN_VALUES = 30  # independent values: with fewer, noise alone exceeds the bounds
 MIN_NIGHTS = 5
 DROP = 0.7  # of the median of the nights before
-MAX_SENTENCES = 12
+MAX_CONCERNED = 4  # frames that are drawn
 
 
-def needs_look(facts: NightFacts) -> list[str]:
-    """Return a sentence for each thing that needs a look, the worst first."""
-    return [*facts.mistakes, *_faults(facts), *_nothing_found(facts), *_sensors(facts),
+class Look(NamedTuple):
+    """What needs a look, as a sentence, and where on the page it is shown."""
+
+    sentence: str
+    anchor: str
+
+
+def needs_look(facts: NightFacts) -> list[Look]:
+    """Return what needs a look, the worst first."""
+    mistakes = [Look(each, "logs") for each in facts.mistakes]
+    return [*mistakes, *_faults(facts), *_nothing_found(facts), *_sensors(facts),
             *_sigmas(facts), *_damage(facts), *_changes(facts)]  # fmt: skip
 
 
-def _faults(facts: NightFacts) -> Iterator[str]:
+def _faults(facts: NightFacts) -> Iterator[Look]:
     faults = {reason.value for reason in Reason.having(Trait.SENSOR_FAULT)}
     for row in facts.left_out:
         if row.reason in faults:
-            yield f"{row.sensor_id or 'A sensor'} is at fault ({row.reason}): {row.sentence}"
+            sentence = f"{row.sensor_id or 'A sensor'} is at fault ({row.reason}): {row.sentence}"
+            yield Look(sentence, "counts")
 
 
-def _nothing_found(facts: NightFacts) -> Iterator[str]:
+def _nothing_found(facts: NightFacts) -> Iterator[Look]:
     if facts.series is None:
-        yield "The night has no frames."
+        yield Look("The night has no frames.", "coverage")
     elif not facts.series.counts[0].any():
-        yield "No star is identified in the whole night."
+        yield Look("No star is identified in the whole night.", "coverage")
     elif not facts.objects:
-        yield "No object is found."
+        yield Look("No object is found.", "sky")
 
 
-def _sensors(facts: NightFacts) -> Iterator[str]:
+def _sensors(facts: NightFacts) -> Iterator[Look]:
     series = facts.series
     if series is None:
         return
@@ -188,9 +240,16 @@ def _sensors(facts: NightFacts) -> Iterator[str]:
     for k, name in enumerate(series.sensors):
         share = series.identified_share[k]
         if share < MIN_IDENTIFIED:
-            yield f"{name}: {percent(share)} of its frames are identified{_why(series, name)}."
+            identified = f"{percent(share)} of its frames are identified{_why(series, name)}"
+            yield Look(f"{name}: {identified}.", _frame_of(facts, name, "coverage"))
         if series.lost_s[k] > LONGEST_LOST * length_s:
-            yield f"{name} has no frames for {duration(series.lost_s[k])} of the night (gaps)."
+            lost = duration(series.lost_s[k])
+            yield Look(f"{name} has no frames for {lost} of the night (gaps).", "coverage")
+
+
+def _frame_of(facts: NightFacts, name: str, otherwise: str) -> str:
+    shown = list(facts.concerned)
+    return f"frame-{shown.index(name) + 1}" if name in shown else otherwise
 
 
 def _why(series: FrameSeries, name: str) -> str:
@@ -201,16 +260,24 @@ def _why(series: FrameSeries, name: str) -> str:
     return f"; most others: {status}"
 
 
-def _sigmas(facts: NightFacts) -> Iterator[str]:
+def _residuals_off(residuals: StarResiduals) -> Iterator[tuple[str, float]]:
+    """Yield sensors whose star residuals do not fit their sigma, with the mean square."""
+    squares = zip(residuals.sensors, residuals.mean_square, residuals.stars, strict=True)
+    for name, square, stars in squares:
+        if np.isfinite(square) and stars >= MIN_VALUES and not holds(square):
+            yield name, float(square)
+
+
+def _sigmas(facts: NightFacts) -> Iterator[Look]:
     if facts.residuals is not None:
-        for name, square, stars in zip(facts.residuals.sensors, facts.residuals.mean_square,
-                                       facts.residuals.stars, strict=True):  # fmt: skip
-            if np.isfinite(square) and stars >= MIN_VALUES and not holds(square):
-                yield f"{name}: star residuals are {_off(square)} than their sigma says."
+        for name, square in _residuals_off(facts.residuals):
+            sentence = f"{name}: star residuals are {_off(square)} than their sigma says."
+            yield Look(sentence, _frame_of(facts, name, "sigmas"))
     for what, chi2 in (("pair distances", facts.chi2.pairs), ("positions", facts.chi2.positions),
                        ("states", facts.chi2.states)):  # fmt: skip
         if chi2 is not None and chi2.independent >= MIN_VALUES and not holds(chi2.mean):
-            yield f"Sigmas of {what} do not hold: the residuals are {_off(chi2.mean)}."
+            sentence = f"Sigmas of {what} do not hold: the residuals are {_off(chi2.mean)}."
+            yield Look(sentence, "sigmas")
 
 
 def holds(mean_square: float) -> bool:
@@ -223,7 +290,7 @@ def _off(mean_square: float) -> str:
     return f"{ratio:.2f} times larger" if ratio > 1 else f"{1 / ratio:.2f} times smaller"
 
 
-def _damage(facts: NightFacts) -> Iterator[str]:
+def _damage(facts: NightFacts) -> Iterator[Look]:
     harmless = {reason.value for reason in Reason.having(Trait.HARMLESS)}
     read = [row for row in facts.left_out if row.stage == Stage.READ]
     counts: dict[str, int] = {}
@@ -232,10 +299,10 @@ def _damage(facts: NightFacts) -> Iterator[str]:
             counts[row.reason] = counts.get(row.reason, 0) + row.number
     if counts:
         listed = ", ".join(f"{reason} {count:,}" for reason, count in counts.items())
-        yield f"Parts of the logs could not be used: {listed}."
+        yield Look(f"Parts of the logs could not be used: {listed}.", "counts")
 
 
-def _changes(facts: NightFacts) -> Iterator[str]:
+def _changes(facts: NightFacts) -> Iterator[Look]:
     *before, tonight = facts.trend
     if len(before) < MIN_NIGHTS:
         return
@@ -245,7 +312,10 @@ def _changes(facts: NightFacts) -> Iterator[str]:
         ("positions", tonight.positions, median(each.positions for each in before)),
     ):
         if now < DROP * usual:
-            yield f"Fewer {what} than usual: {now:,}. Median of the nights before: {usual:,.0f}."
+            sentence = (
+                f"Fewer {what} than usual: {now:,}. Median of the nights before: {usual:,.0f}."
+            )
+            yield Look(sentence, "trend")
 
 
 def percent(share: float) -> str:

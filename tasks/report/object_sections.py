@@ -1,8 +1,7 @@
 """Sections about what was found: tracklets, epipolar lines, objects, the last nights."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from functools import partial
-from math import floor, log10
 
 from epipole.schemas.rejects import NameStatus, ObjectVerdict, Outcome
 from epipole.tasks.report.canvas import as_svg
@@ -10,6 +9,7 @@ from epipole.tasks.report.draw_sensors import IMAGE_IN, draw_epipolar
 from epipole.tasks.report.draw_sky import draw_elements, draw_ring, draw_sky, draw_trend
 from epipole.tasks.report.frame_series import clock
 from epipole.tasks.report.html import (
+    Link,
     Section,
     beside,
     figure,
@@ -17,13 +17,14 @@ from epipole.tasks.report.html import (
     nothing,
     paragraph,
     table,
+    with_sigma,
 )
 from epipole.tasks.report.night_facts import NightFacts, percent
+from epipole.tasks.report.object_parts import detailed
 from epipole.tasks.report.objects import NightObject
 
 MAX_OBJECTS = 100
 PICTURE_IN = 2.8
-NO_SIGMA = 1e-9  # smaller ones are none
 
 
 def sky(facts: NightFacts) -> Section:
@@ -34,7 +35,7 @@ def sky(facts: NightFacts) -> Section:
     total = sum(tracks.counts.values())
     some = f" Drawn are {len(tracks.lines):,} of {total:,}." if len(tracks.lines) < total else ""
     picture = figure(
-        as_svg(partial(draw_sky, tracks=tracks), 3.2),
+        as_svg(partial(draw_sky, tracks=tracks, anchors=facts.anchors), 3.2),
         f"{total:,} tracklets in right ascension and declination, by what became of them.",
         "Tracklets of all sensors; the marker is at the end. Each sensor sees an object in another "
         "direction. Most should belong to an object where sensors look at the same region." + some,
@@ -54,7 +55,7 @@ def epipolar(facts: NightFacts) -> Section:
         return Section("epipolar", title, nothing(sentence))
     farthest = max((line.distance_px for line in views.lines), default=0.0)
     picture = figure(
-        as_svg(partial(draw_epipolar, views=views), IMAGE_IN),
+        as_svg(partial(draw_epipolar, views=views, anchors=facts.anchors), IMAGE_IN),
         f"Image of {views.in_sensor} with {len(views.lines)} lines of sight of "
         f"{views.from_sensor}.",
         f"What {views.from_sensor} sees at {clock(views.epoch_ns)} UTC is a line in the image of "
@@ -79,19 +80,20 @@ def objects(facts: NightFacts) -> Section:
     pictures = []
     if ring:
         pictures.append(figure(
-            as_svg(partial(draw_ring, objects=ring), PICTURE_IN),
+            as_svg(partial(draw_ring, objects=ring, anchors=facts.anchors), PICTURE_IN),
             f"Longitude and latitude of {len(ring)} objects near the geostationary ring.",
             "Objects near the geostationary ring: from their first to their last position, which "
             "has the marker. A station-kept one hardly moves.",
         ))  # fmt: skip
     if others:
         pictures.append(figure(
-            as_svg(partial(draw_elements, objects=others), 3.6),
+            as_svg(partial(draw_elements, objects=others, anchors=facts.anchors), 3.6),
             f"Semi-major axis, eccentricity and inclination of {len(others)} objects.",
             "The other objects, by their orbits, with bars of one sigma. From a short arc, axis "
             "and eccentricity are uncertain: their scatter is not that of orbits.",
         ))  # fmt: skip
-    body = beside(figures(pictures), paragraph(_names(found)) + _verdicts(found)) + _table(found)
+    body = beside(figures(pictures), paragraph(_names(found)) + _verdicts(found))
+    body += _table(found, facts.anchors) + detailed(facts)
     return Section("objects", title, body)
 
 
@@ -113,13 +115,13 @@ def _verdicts(found: Sequence[NightObject]) -> str:
     return table("What is to be thought of them", ("verdict", "objects", "meaning"), rows)
 
 
-def _table(found: Sequence[NightObject]) -> str:
+def _table(found: Sequence[NightObject], anchors: Mapping[str, str]) -> str:
     order = sorted(found, key=lambda each: (each.status == NameStatus.KNOWN, -each.positions))
     shown = order[:MAX_OBJECTS]
     rows = [
-        (each.object_id, each.status, each.name, each.verdict, f"{each.positions:,}",
-         clock(each.first_ns),
-         clock(each.last_ns), str(each.sensors), _number(each.sigma_km), *_geography(each))
+        (_link(each.object_id, anchors), each.status, each.name, each.verdict,
+         f"{each.positions:,}", clock(each.first_ns), clock(each.last_ns), str(each.sensors),
+         _number(each.sigma_km), *_geography(each))
         for each in shown
     ]  # fmt: skip
     caption = "Objects; unknown ones first"
@@ -128,6 +130,11 @@ def _table(found: Sequence[NightObject]) -> str:
     heading = ("object", "status", "name", "verdict", "positions", "from", "to", "sensors",
                "sigma km", "radius km", "longitude", "latitude", "a km", "e", "i deg")  # fmt: skip
     return table(caption, heading, rows)
+
+
+def _link(object_id: str, anchors: Mapping[str, str]) -> Link | str:
+    anchor = anchors.get(object_id)
+    return Link(object_id, anchor[1:]) if anchor else object_id
 
 
 def _number(value: float) -> str:
@@ -141,15 +148,7 @@ def _geography(each: NightObject) -> tuple[str, ...]:
     geography = f"{radius:,.0f}", f"{longitude:.2f}", f"{latitude:.2f}"
     if each.elements is None:
         return (*geography, "", "", "")
-    return *geography, *map(_with_sigma, each.elements, each.element_sigmas)
-
-
-def _with_sigma(value: float, sigma: float) -> str:
-    """Return a value to the second digit of its sigma."""
-    if not NO_SIGMA < sigma < float("inf"):
-        return f"{value:,.5g}"
-    decimals = min(max(1 - floor(log10(sigma)), 0), 9)
-    return f"{value:,.{decimals}f} ± {sigma:,.{decimals}f}"
+    return *geography, *map(with_sigma, each.elements, each.element_sigmas)
 
 
 def trend(facts: NightFacts) -> Section:

@@ -2,7 +2,7 @@
 
 import logging
 from collections.abc import Iterable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import erfa
 import numpy as np
@@ -14,6 +14,7 @@ from epipole.schemas.columns import POSITION
 from epipole.schemas.errors import DatasetError
 from epipole.schemas.rejects import NameStatus, Outcome
 from epipole.tasks.algorithms.times import utc_julian_date
+from epipole.tasks.report.frame_series import clock
 
 # Objects: where they are, how they move, and what is known of their names.
 
@@ -48,6 +49,16 @@ class NightObject(NamedTuple):
     ends: tuple[Geography, Geography] | None
     elements: tuple[float, float, float] | None
     element_sigmas: tuple[float, float, float]
+
+    @property
+    def about(self) -> str:
+        """Which it is, in a line."""
+        name = f" {self.name}" if self.name else ""
+        sigma = f", sigma {self.sigma_km:.3g} km" if self.sigma_km == self.sigma_km else ""
+        return (
+            f"{self.object_id}{name}: {self.status}, {self.verdict}, {self.sensors} sensors, "
+            f"{clock(self.first_ns)} to {clock(self.last_ns)}{sigma}"
+        )
 
     @property
     def near_geostationary(self) -> bool:
@@ -157,10 +168,15 @@ POINTS = 6  # of a line, about
 
 
 class SkyTrack(NamedTuple):
-    """A tracklet: its outcome, and (n, 2) right ascension and declination [deg] along it."""
+    """A tracklet: its outcome, and (n, 2) right ascension and declination [deg] along it.
+
+    `object_id` is '' without an object; `about` says which it is.
+    """
 
     outcome: str
     radec_deg: Array
+    object_id: str
+    about: str
 
 
 class SkyTracks(NamedTuple):
@@ -172,7 +188,8 @@ class SkyTracks(NamedTuple):
 
 def read_sky_tracks(night: NightReader) -> SkyTracks | None:
     """Return the tracklets of a night; None without tracklets. Of many, every n-th is drawn."""
-    columns = ["tracklet_id", "outcome", "n_detections"]
+    columns = ["tracklet_id", "outcome", "n_detections", "object_id", "sensor_id", "start_time",
+               "cov_decdec"]  # fmt: skip
     drawn: list[pl.DataFrame] = [night.empty("tracklets", columns)]
     counts: dict[str, int] = {}
     step = max(-(-night.count("tracklets") // MAX_DRAWN), 1)
@@ -187,13 +204,24 @@ def read_sky_tracks(night: NightReader) -> SkyTracks | None:
     chosen = pl.concat(drawn)
     directions = _directions(night, chosen)
     lines = [
-        SkyTrack(outcome, directions[name])
-        for name, outcome, _ in chosen.iter_rows()
-        if name in directions
-    ]
+        SkyTrack(row["outcome"], directions[row["tracklet_id"]], row["object_id"] or "",
+                 _about(row))
+        for row in chosen.with_columns(pl.col("start_time").dt.epoch("ns")).to_dicts()
+        if row["tracklet_id"] in directions
+    ]  # fmt: skip
     order = [outcome.value for outcome in Outcome]
     known = {outcome: counts[outcome] for outcome in order if outcome in counts}
     return SkyTracks(known, lines)
+
+
+def _about(row: dict[str, Any]) -> str:
+    variance = row["cov_decdec"]
+    sigma = "" if variance is None else f", sigma {max(variance, 0.0) ** 0.5:.2g} arcsec"
+    of = f", object {row['object_id']}" if row["object_id"] else ""
+    return (
+        f"{row['tracklet_id']}{of}: {row['sensor_id']} from {clock(row['start_time'])}, "
+        f"{row['n_detections']:,} detections{sigma}, {row['outcome']}"
+    )
 
 
 def _directions(night: NightReader, chosen: pl.DataFrame) -> dict[str, Array]:

@@ -2,16 +2,28 @@
 
 from collections.abc import Sequence
 from functools import partial
-from pathlib import Path
-from string import Template
 
 from epipole.schemas.text import as_line
 from epipole.tasks.report.canvas import Draw, as_png
 from epipole.tasks.report.draw_sensors import coverage_height, draw_coverage
 from epipole.tasks.report.draw_sky import draw_elements, draw_half_normal, draw_normal, draw_ring
-from epipole.tasks.report.html import Section, bullets, nothing, paragraph, table, text, tiles
+from epipole.tasks.report.html import (
+    LOOK,
+    WELL,
+    Link,
+    Section,
+    bullets,
+    document,
+    nothing,
+    paragraph,
+    section,
+    table,
+    text,
+    tiles,
+)
 from epipole.tasks.report.night_facts import (
     LeftOut,
+    Look,
     NightFacts,
     PagePicture,
     ReportExtract,
@@ -29,8 +41,11 @@ from epipole.tasks.report.sensor_sections import (
 
 # The page: its head, and all sections in order.
 
-TEMPLATE = Path(__file__).with_name("page.html")
 MAX_LOOKS = 12
+HELP = (
+    "Point at a dot of a picture to see what it is; a click leads to its object. By keyboard: the "
+    "arrows go from dot to dot, Enter follows, + and - zoom, Shift with arrows moves, 0 shows all."
+)
 MAX_LOGS = 50
 MAX_SENSORS = 8  # that one line names
 LONGEST_NAME = 40
@@ -41,29 +56,28 @@ def night_page(facts: NightFacts) -> str:
     sections = [counts(facts), coverage(facts), sigmas(facts), attitudes(facts), star_map(facts),
                 image_residuals(facts), sky(facts), epipolar(facts), objects(facts),
                 trend(facts), logs(facts)]  # fmt: skip
-    return Template(TEMPLATE.read_text(encoding="utf-8")).substitute(
-        title=text(f"Night {facts.night}"),
-        night=text(facts.night),
-        head=_head(facts),
+    looks = needs_look(facts)
+    return document(
+        f"Night {facts.night}",
+        verdict=f"{LOOK} {len(looks)}" if looks else WELL,
+        head=_head(facts, looks),
         contents="".join(f'<li><a href="#{s.anchor}">{text(s.title)}</a></li>\n' for s in sections),
-        sections="".join(map(_section, sections)),
+        sections="".join(map(section, sections)),
     )
 
 
-def _section(section: Section) -> str:
-    return (
-        f'<section id="{section.anchor}">\n<h2>{text(section.title)}</h2>\n'
-        f"{section.body}</section>\n"
-    )
-
-
-def _head(facts: NightFacts) -> str:
+def _head(facts: NightFacts, looks: Sequence[Look]) -> str:
     about = (
         f"{facts.dataset} · {_many(len(facts.sources), 'log')} · "
         f"{_many(0 if facts.series is None else len(facts.series.sensors), 'sensor')} · "
         f"epipole {', '.join(sorted(set(facts.sources['code_version'])))}"
     )
-    return paragraph(about, "about") + paragraph(_in_short(facts)) + _looks(needs_look(facts))
+    return (
+        paragraph(about, "about")
+        + paragraph(_in_short(facts))
+        + _looks(looks)
+        + paragraph(HELP, "help")
+    )
 
 
 def _in_short(facts: NightFacts) -> str:
@@ -75,12 +89,12 @@ def _in_short(facts: NightFacts) -> str:
     )
 
 
-def _looks(sentences: Sequence[str]) -> str:
-    if not sentences:
+def _looks(looks: Sequence[Look]) -> str:
+    if not looks:
         return '<div class="well"><h2>Nothing needs a look.</h2></div>\n'
-    shown = list(sentences[:MAX_LOOKS])
-    if len(sentences) > len(shown):
-        shown.append(f"And {len(sentences) - len(shown)} more; the sections below have them.")
+    shown: list[Link | str] = [Link(*look) for look in looks[:MAX_LOOKS]]
+    if len(looks) > len(shown):
+        shown.append(f"And {len(looks) - len(shown)} more; the sections below have them.")
     return f'<div class="look"><h2>Needs a look</h2>\n{bullets(shown)}</div>\n'
 
 
@@ -166,9 +180,9 @@ def _pictures(facts: NightFacts) -> list[tuple[str, Draw, float]]:
     ring = [each for each in facts.objects if each.near_geostationary]
     bound = [each for each in facts.objects if each.has_orbit and not each.near_geostationary]
     if ring:
-        draw = partial(draw_ring, objects=ring)
+        draw = partial(draw_ring, objects=ring, anchors={})
         found.append(("Objects in longitude and latitude", draw, PICTURE_IN))
     if bound:
-        draw = partial(draw_elements, objects=bound)
+        draw = partial(draw_elements, objects=bound, anchors={})
         found.append(("Objects by their elements", draw, 3.2))
     return found

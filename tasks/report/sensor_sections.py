@@ -251,7 +251,27 @@ def star_map(facts: NightFacts) -> Section:
         f"usual number of stars, which have {names}. Arrows are star residuals, drawn {scale:,.0f} "
         "times longer. They should point in all directions; a pattern is an error of the optics.",
     )
-    return Section("frame", title, beside(figures([picture]), _stars_table(frame, ids)))
+    body = beside(figures([picture]), _stars_table(frame, ids))
+    return Section("frame", title, body + _concerned(facts))
+
+
+def _concerned(facts: NightFacts) -> str:
+    """Return the frames of sensors that need a look."""
+    if not facts.concerned:
+        return ""
+    pictures = []
+    for number, frame in enumerate(facts.concerned.values(), start=1):
+        size = facts.size_px(frame.sensor_id)
+        why = f"not identified: {frame.status}" if frame.status else "its star residual is large"
+        pictures.append(figure(
+            as_svg(partial(draw_star_map, frame=frame, size_px=size), IMAGE_IN),
+            f"Frame {frame.frame_number} of {frame.sensor_id}: {len(frame.star_id)} stars, "
+            f"{len(frame.others_px)} other detections.",
+            f"Frame {frame.frame_number} of {frame.sensor_id} at {clock(frame.time_ns)} UTC, "
+            f"{why}. It is of the time with most such frames.",
+            f"frame-{number}",
+        ))  # fmt: skip
+    return "<h3>Frames of sensors that need a look</h3>\n" + figures(pictures)
 
 
 def _stars_table(frame: StarMap, ids: str) -> str:

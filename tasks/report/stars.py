@@ -1,6 +1,6 @@
 """Stars of a night: residuals against their sigma and over the image, and a map of one frame."""
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -161,6 +161,8 @@ class StarMap(NamedTuple):
     stars_px, residuals_px : (n, 2) pixel positions and residuals of its stars
     others_px : (m, 2) detections that are no stars, the brightest
     objects : (m,) which of them belong to a track
+    says, others_say : what each star and each other detection is
+    status : why it is not identified; None: it is
     """
 
     sensor_id: str
@@ -172,6 +174,9 @@ class StarMap(NamedTuple):
     residuals_px: Array
     others_px: Array
     objects: npt.NDArray[np.bool_]
+    says: list[str]
+    others_say: list[str]
+    status: str | None = None
 
 
 def read_star_map(night: NightReader, series: FrameSeries) -> StarMap | None:
@@ -188,19 +193,65 @@ def read_star_map(night: NightReader, series: FrameSeries) -> StarMap | None:
     frame = _usual_frame(night, series, k, bin_)
     if frame is None:
         return None
-    number, time_ns = frame
-    in_frame = (pl.col("sensor_id") == series.sensors[k]) & (pl.col("frame_number") == number)
+    return _map_of(night, series.sensors[k], *frame)
+
+
+def read_frame_concerned(night: NightReader, series: FrameSeries, k: int) -> StarMap | None:
+    """Return the frame of a sensor that needs a look the most.
+
+    One that is not identified, of the time with most of these; of a sensor whose frames all are,
+    the one with the largest star residual. None: it has neither.
+    """
+    failed = series.counts[1:, k].sum(axis=0)
+    residual = np.nan_to_num(series.rms["residual"][k])
+    if not failed.any() and not residual.any():
+        return None
+    bin_ = int(np.argmax(failed if failed.any() else residual))
+    length = (series.bins.end_ns - series.bins.start_ns) / series.bins.number
+    start = series.bins.start_ns + int(bin_ * length)
+    columns = ["time", "sensor_id", "frame_number", "status", "residual_px"]
+    pieces = night.pieces("frames", columns, (start, start + int(length) + 2))
+    of_sensor = [rows.filter(sensor_id=series.sensors[k]) for rows in pieces]
+    found = pl.concat([night.empty("frames", columns), *of_sensor])
+    chosen = found.drop_nulls("status") if failed.any() else found.drop_nulls("residual_px")
+    chosen = chosen.sort("residual_px", descending=True, nulls_last=True, maintain_order=True)
+    if not len(chosen):
+        return None
+    row = chosen.row(0, named=True)
+    time_ns = int(chosen["time"].dt.epoch("ns")[0])
+    made = _map_of(night, series.sensors[k], row["frame_number"], time_ns)
+    return made._replace(status=row["status"])
+
+
+def _map_of(night: NightReader, sensor_id: str, number: int, time_ns: int) -> StarMap:
+    in_frame = (pl.col("sensor_id") == sensor_id) & (pl.col("frame_number") == number)
     columns = ["time", "sensor_id", "frame_number", "x_px", "y_px"]
     stars = _rows(night, "stars", [*columns, "star_id", "magnitude", "dx_px", "dy_px"], time_ns)
-    others = _rows(night, "detections", [*columns, "flux", "track_id"], time_ns).filter(in_frame)
+    seen = [*columns, "flux", "track_id", "tracklet_id", "sigma_arcsec", "kind"]
+    others = _rows(night, "detections", seen, time_ns).filter(in_frame)
     others = others.sort("flux", descending=True, nulls_last=True, maintain_order=True)
     others, stars = others.head(MAX_OTHERS), stars.filter(in_frame)
     return StarMap(
-        series.sensors[k], number, time_ns,
+        sensor_id, number, time_ns,
         stars["star_id"].to_numpy(), stars["magnitude"].to_numpy(),
         stars.select("x_px", "y_px").to_numpy(), stars.select("dx_px", "dy_px").to_numpy(),
         others.select("x_px", "y_px").to_numpy(), others["track_id"].is_not_null().to_numpy(),
+        [_of_star(row) for row in stars.to_dicts()], [_of_other(row) for row in others.to_dicts()],
     )  # fmt: skip
+
+
+def _of_star(row: dict[str, Any]) -> str:
+    return (
+        f"star {row['star_id']}: magnitude {row['magnitude']:.2f}, at {row['x_px']:.1f}, "
+        f"{row['y_px']:.1f} px, residual {row['dx_px']:+.3f}, {row['dy_px']:+.3f} px"
+    )
+
+
+def _of_other(row: dict[str, Any]) -> str:
+    of = f"tracklet {row['tracklet_id']}" if row["tracklet_id"] else "no tracklet"
+    sigma = row["sigma_arcsec"]
+    stated = f", sigma {sigma:.2g} arcsec" if sigma is not None else ""
+    return f"{row['kind']}, {of}: at {row['x_px']:.1f}, {row['y_px']:.1f} px{stated}"
 
 
 def _usual_frame(

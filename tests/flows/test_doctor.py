@@ -65,7 +65,7 @@ def test_a_run_writes_the_same_checks_and_shows_mistakes(prefect, wrong_log, tmp
     assert "1 mistake in the logs" in summary.sentence()
     assert summary.mistakes[0] in caplog.messages
     facts = read_night_facts(night_reader(str(tmp_path / "out"), NIGHT), "out")
-    assert needs_look(facts)[0] == summary.mistakes[0]
+    assert needs_look(facts)[0].sentence == summary.mistakes[0]
 
 
 def test_a_sound_night_has_no_wrong_check(night_dataset):

@@ -1,6 +1,7 @@
 """The report: as a command, at the end of a run, in a browser."""
 
 import json
+import re
 import shutil
 import subprocess
 import sys
@@ -121,11 +122,40 @@ def test_the_trend_is_of_the_nights_before(night_dataset, tmp_path):
     assert "2019-04-02" not in page
 
 
+def test_without_a_night_it_is_a_calendar_with_links_to_their_pages(night_dataset, tmp_path):
+    dataset = tmp_path / "out"
+    for night in (NIGHT, "2019-04-02"):
+        shutil.copytree(night_dataset / f"night={NIGHT}", dataset / f"night={night}")
+    shutil.copytree(night_dataset / "reports", dataset / "reports")
+    (dataset / "night=2019-04-03" / "nights").mkdir(parents=True)
+    (dataset / "night=2019-04-03" / "nights" / "part-0.parquet").write_bytes(b"no parquet")
+    report(str(dataset), None, tmp_path / "pages" / "nights.html")
+    page = (tmp_path / "pages" / "nights.html").read_text()
+    (link,) = re.findall(r'<a class="night good"[^>]*href="([^"]*)"', page)
+    assert (tmp_path / "pages" / link).resolve() == dataset / "reports" / f"{NIGHT}.html"
+    assert '<span class="night good counted"' in page
+    assert "2019-04-03: its table `nights` is missing or cannot be read" in page
+    with pytest.raises(DatasetError, match="has no night"):
+        report(str(tmp_path / "none"), None, tmp_path / "a.html")
+
+
 CHROMIUM = shutil.which("chromium")
-# Adds to the page what a browser can say of it: its width, and the pictures that it could not draw.
-PROBE = """<script>addEventListener("load", () => { const pictures = [...document.images];
-document.title = JSON.stringify({wide: document.documentElement.scrollWidth - innerWidth,
-inner: innerWidth, drawn: pictures.filter(p => p.complete && p.naturalWidth > 0).length,
+# Adds to the page what a browser can say of it: its width, its pictures, and what keys do.
+PROBE = """<script>addEventListener("load", () => {
+const pictures = [...document.querySelectorAll("svg.plot")].filter(p => !p.closest("details"));
+const press = (svg, ...keys) => keys.forEach(key =>
+  svg.dispatchEvent(new KeyboardEvent("keydown", {key})));
+const says = () => document.getElementById("tip").textContent;
+const [frame, sky] = ["frame", "sky"].map(id => document.querySelector(`#${id} svg.plot`));
+press(frame, "ArrowRight", "ArrowLeft"); const star = says();
+press(frame, "+", "+"); const zoomed = frame.classList.contains("zoomed");
+const ticks = frame.querySelectorAll(".own text").length;
+press(frame, "0"); const whole = !frame.classList.contains("zoomed");
+press(sky, "ArrowRight", "Enter"); dispatchEvent(new HashChangeEvent("hashchange"));
+document.title = JSON.stringify({star, zoomed, ticks, whole,
+opened: document.querySelectorAll("details[open]").length,
+wide: document.documentElement.scrollWidth - innerWidth,
+inner: innerWidth, drawn: pictures.filter(p => p.getBoundingClientRect().height > 50).length,
 pictures: pictures.length, fetched: performance.getEntriesByType("resource")
   .filter(e => !e.name.startsWith("data:")).length}); })</script></body>"""
 
@@ -133,8 +163,8 @@ pictures: pictures.length, fetched: performance.getEntriesByType("resource")
 def browse(page, folder, width):
     """Return what the browser says of a page, and its console."""
     # A page may not be narrower than 500 px in a window: a frame in it may.
-    allowed = "default-src 'none'", "script-src 'unsafe-inline'; default-src 'none'"
-    inner = page.replace("</body>", PROBE).replace(*allowed)
+    inner = page.replace("</body>", PROBE)
+    inner = re.sub(r"script-src 'sha256-[^']*'", "script-src 'unsafe-inline'", inner)
     (folder / "page.html").write_text(inner)
     (folder / "frame.html").write_text(
         f'<iframe id=f src="page.html" style="width:{width}px;height:800px;border:0"></iframe>'
@@ -162,5 +192,10 @@ def test_a_browser_shows_all_of_it_without_scrolling_sideways(night_dataset, tmp
     assert seen["inner"] == width
     assert seen["wide"] <= 0
     assert seen["drawn"] == seen["pictures"] >= 12
+    assert seen["star"].startswith("star ")
+    assert seen["zoomed"]
+    assert seen["ticks"] >= 4
+    assert seen["whole"]
+    assert seen["opened"] == 1
     assert seen["fetched"] == 0
     assert console == []

@@ -1,11 +1,14 @@
 """All facts of a night, from a real small run and from made-up ones."""
 
 import numpy as np
+import polars as pl
 import pytest
 from scenes.made_nights import hostile_night, reader_of
 
 from epipole.io.datasets.dataset import night_reader
-from epipole.tasks.report.night_facts import needs_look, read_night_facts
+from epipole.tasks.report import object_details
+from epipole.tasks.report.night_facts import look_first, needs_look, read_night_facts
+from epipole.tasks.report.object_details import read_object_details
 
 NIGHT = "2019-04-01"
 
@@ -45,10 +48,39 @@ def test_the_map_is_of_one_frame(facts):
 def test_an_empty_night_has_no_facts_and_says_so():
     facts = read_night_facts(reader_of({}), "out")
     assert facts.series is None
-    assert needs_look(facts) == ["The night has no frames."]
+    assert needs_look(facts) == [("The night has no frames.", "coverage")]
 
 
 def test_a_sensor_at_fault_stands_first():
     sentences = needs_look(read_night_facts(hostile_night("s1"), "out"))
-    assert sentences[0].startswith("s1 is at fault (clock_off)")
-    assert any("50.0 % of its frames are identified" in sentence for sentence in sentences)
+    assert sentences[0].sentence.startswith("s1 is at fault (clock_off)")
+    (share,) = [
+        each for each in sentences if "50.0 % of its frames are identified" in each.sentence
+    ]
+    assert share.anchor == "frame-1"
+
+
+def test_the_frame_concerned_is_one_that_is_not_identified():
+    facts = read_night_facts(hostile_night("s1"), "out")
+    (frame,) = facts.concerned.values()
+    assert (frame.sensor_id, frame.status) == ("s1", "s1")
+    assert frame.frame_number >= 6
+    assert len(frame.star_id) == 0
+
+
+def test_an_object_has_its_observations_and_its_orbit(facts):
+    assert [each.object_id for each in facts.details] == [
+        each.object_id for each in look_first(facts.objects)
+    ]
+    for each in facts.details:
+        assert each.orbit["object_id"] == each.object_id
+        assert each.by_sensor["count"].sum() >= len(each.seen) > 50
+        fitted = each.by_sensor.select(pl.col("count").dot("mean_square") / pl.col("count").sum())
+        assert 1.5 < fitted.item() < 2.6
+
+
+def test_of_many_observations_some_are_kept(monkeypatch, night_dataset):
+    monkeypatch.setattr(object_details, "MAX_DOTS", 90)
+    made = read_object_details(night_reader(night_dataset, NIGHT), ["20190401-00001"])
+    assert made[0].step == 3
+    assert len(made[0].seen) == -(-made[0].by_sensor["count"].sum() // 3)
