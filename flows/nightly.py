@@ -198,7 +198,7 @@ def stage_night(
 
     `whole` are `sources` and `rejects` of the run.
     """
-    made = make_night(frames, date, folder, settings)
+    made = make_night(frames, date, folder, earlier.usual_sensors(date), settings)
     earlier_key = earlier.key(date, settings)
     names = name(made.work, made.solved, date, earlier.last_views(date), settings)
     elements, unused = choose_elements(catalogue, date, settings)
@@ -223,13 +223,14 @@ class MadeNight(NamedTuple):
 
 
 def make_night(
-    frames: OrderedFrames, night: str, folder: WorkFolder, settings: Settings
+    frames: OrderedFrames, night: str, folder: WorkFolder, usual: Sequence[str], settings: Settings
 ) -> MadeNight:
     """Turn the frames of a night, and of half an hour before and after it, into solved objects.
 
-    What a night holds does not depend on the other nights of the run.
+    What a night holds does not depend on the other nights of the run, but for the check whether
+    its sensors are there: `usual` are those of nights before.
     """
-    checks = check_logs(frames, night, settings)
+    checks = check_logs(frames, night, usual, settings)
     spans, uncalibrated = plan_spans(frames, night)
     work = identify(frames, spans, folder, settings)
     work, stated = find_cameras(work, settings)

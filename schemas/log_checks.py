@@ -75,6 +75,12 @@ class LogCheck(StrEnum):
         "Share of the frames that have a state near.",
         "{percent:.3g} % of the frames have a state near",
     )
+    FRAMES_ALL_NIGHT = (
+        "frames_all_night",
+        "Share of the night in which the sensor has no frames. A night lasts from the first frame "
+        "of any sensor to the last; only a run compares them.",
+        "there are frames all night, but for {percent:.2g} % of it",
+    )
     FRAME_TIMES = (
         "frame_times",
         "Largest time, of a second and a tenth, of which all times of frames are multiples.",
@@ -347,6 +353,16 @@ class LogCause(StrEnum):
     )
     NO_STATES = "no_states", CheckVerdict.UNKNOWN, "there are no states: no positions", ""
 
+    # Of the night.
+    NO_FRAMES = "no_frames", CheckVerdict.WRONG, "no frames in the whole night", ""
+    LONG_GAPS = (
+        "long_gaps",
+        CheckVerdict.WRONG,
+        "no frames for {lost_s:,.0f} s of the {length_s:,.0f} s of the night, the longest time "
+        "from {gap_from} to {gap_to} UTC",
+        "",
+    )
+
     # Of images.
     PRINCIPAL_POINT_ZERO = (
         "principal_point_zero",
@@ -440,7 +456,7 @@ MISTAKE_COLUMNS = ("sensor_id", "check", "verdict", "cause", "sentence")
 
 
 def mistakes(checks: Iterable[Mapping[str, Any]]) -> list[str]:
-    """Return a sentence for each mistake, with the sensors that have it.
+    """Return a sentence for each mistake, with the sensors that have it; of gaps, each has one.
 
     Parameters
     ----------
@@ -451,7 +467,8 @@ def mistakes(checks: Iterable[Mapping[str, Any]]) -> list[str]:
     sentences: dict[tuple[str, str], str] = {}
     for row in checks:
         if row["verdict"] == CheckVerdict.WRONG:
-            key = (row["check"], row["cause"])
+            of_gaps = row["cause"] == LogCause.LONG_GAPS
+            key = (row["check"], row["sentence"] if of_gaps else row["cause"])
             sensors.setdefault(key, []).append(row["sensor_id"])
             sentences.setdefault(key, row["sentence"])
     return [f"{_listed(sensors[key])}: {sentence}" for key, sentence in sentences.items()]

@@ -84,6 +84,18 @@ class SensorSettings(Group):
         le=DAY_S,
         description="A frame farther than this from the nearest state gets no position.",
     )
+    expected: tuple[str, ...] | None = Field(
+        None,
+        description="Ids of the sensors that each night should have frames of; one that has none "
+        "needs a look. Default: those that half of the nights of the 30 days before have.",
+    )
+    max_gaps: float = Field(
+        0.02,
+        ge=0,
+        le=1,
+        description="Largest share of the night, from its first to its last frame, in which a "
+        "sensor may have no frames; with more it needs a look.",
+    )
 
 
 class IdentificationSettings(Group):

@@ -533,6 +533,7 @@ NIGHTS = schema(
         ),
         column("earlier_key", pa.string(), doc="Digest of these keys of the nights before."),
         *[column(name, I64, doc=doc) for name, doc in _COUNTS],
+        column("sensor_ids", TEXTS, doc="The star sensors that have frames."),
         column("faults", TEXTS, doc="Sensors at fault, a sentence each."),
         column(
             "residuals",

@@ -1,6 +1,7 @@
 """The checks of a night's logs: what was written otherwise than it says."""
 
 import logging
+from collections.abc import Sequence
 
 import pyarrow as pa
 
@@ -15,14 +16,24 @@ from epipole.schemas.stages import Stage
 from epipole.schemas.tables import CHECKS
 from epipole.tasks.check.judge_readings import judge_readings
 from epipole.tasks.common.batches import in_batches
-from epipole.tasks.read.judge_logs import judge_logs, judged_sensors
+from epipole.tasks.read.judge_logs import (
+    NightFrames,
+    absent_sensors,
+    judge_logs,
+    judged_sensors,
+)
 from epipole.tasks.read.order_frames import OrderedFrames
 
 LOGGER = logging.getLogger(__name__)
 
 
-def check_logs(frames: OrderedFrames, night: str, settings: Settings) -> pa.Table:
-    """Return CHECKS of the logs of a night, and of half an hour before and after it."""
+def check_logs(
+    frames: OrderedFrames, night: str, usual: Sequence[str], settings: Settings
+) -> pa.Table:
+    """Return CHECKS of the logs of a night, and of half an hour before and after it.
+
+    `usual` are the sensors that nights before have frames of.
+    """
     start_ns = day_of(night) * DAY_NS
     between_ns = (start_ns - SPAN_NS, start_ns + DAY_NS + SPAN_NS)
     of_night = rows_of_night("rejects", frames.rejects, night)
@@ -31,11 +42,25 @@ def check_logs(frames: OrderedFrames, night: str, settings: Settings) -> pa.Tabl
         name: sum(each.n_frames for each in spans)
         for name, spans in zip(frames.sensors, frames.spans, strict=True)
     }
+    present = {
+        name: [each for each in spans if each.span.start_ns // DAY_NS == day_of(night)]
+        for name, spans in zip(frames.sensors, frames.spans, strict=True)
+    }
+    of_sensors = [each for spans in present.values() for each in spans]
+    extent = NightFrames(
+        min((each.first_ns for each in of_sensors), default=0),
+        max((each.last_ns for each in of_sensors), default=0),
+        settings.sensors.max_gaps,
+    )
+    expected = usual if settings.sensors.expected is None else settings.sensors.expected
+    absent = absent_sensors(name for name in expected if not present.get(name))
     futures = [
-        judge_logs.submit(batch, frames.cameras, of_night, between_ns, settings.sensors.state_gap_s)
+        judge_logs.submit(
+            batch, frames.cameras, of_night, between_ns, settings.sensors.state_gap_s, extent
+        )
         for batch in in_batches(sensors, [n_frames.get(each.sensor_id, 0) for each in sensors])
     ]
-    return _with_warnings(concat(CHECKS, results(Stage.READ, futures)))
+    return _with_warnings(concat(CHECKS, [*results(Stage.READ, futures), absent]))
 
 
 def check_readings(work: Work, checks: pa.Table) -> pa.Table:

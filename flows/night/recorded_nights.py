@@ -30,11 +30,12 @@ from epipole.io.datasets.dataset import (
     read_table,
     table_pieces,
 )
-from epipole.io.datasets.night_tables import write_table
+from epipole.io.datasets.night_tables import read_columns, write_table
 from epipole.io.datasets.table_pieces import MAX_BYTES, within_bounds
 from epipole.io.logs.logged_times import open_mcap, read_digest
 from epipole.io.work.recipe import Recipe, digest_of, logs_key, recipe_of
 from epipole.schemas.bridge import array, concat, from_polars, rows_with, table, to_polars
+from epipole.schemas.dates import nights_before
 from epipole.schemas.errors import DatasetError, LogError
 from epipole.schemas.rejects import Reason
 from epipole.schemas.settings import Settings
@@ -66,6 +67,7 @@ def write_night_row(
         "code_version": metadata.version("epipole"),
         "earlier_key": earlier_key,
         **count([folder]),
+        "sensor_ids": sorted(set(read_columns(folder, "frames", ["sensor_id"])[0].to_pylist())),
         "faults": [str(fault) for fault in faults],
         "residuals": [str(residual) for residual in residuals],
     }
@@ -89,6 +91,7 @@ def key_of(row: dict[str, Any] | None) -> str:
 LOGGER = logging.getLogger(__name__)
 
 HOUR_NS = 3_600_000_000_000
+MONTH = 30  # days
 
 T = TypeVar("T")
 
@@ -100,6 +103,7 @@ class EarlierNights:
     dataset: str
     staged: Mapping[str, Path]
     _left_out: set[str] = field(default_factory=set)  # that cannot be read
+    _rows: dict[str, dict[str, Any] | None] = field(default_factory=dict)  # of `nights`
 
     def last_views(self, night: str) -> pa.Table:
         """Return the OBJECT_DETECTIONS of the last half hour before a night, each detection once.
@@ -132,13 +136,23 @@ class EarlierNights:
         nights = {str(np.datetime64(day, "D")) for day in range(first, day_of(night))}
         return sorted(nights.intersection([*nights_in(self.dataset), *self.staged]))
 
+    def usual_sensors(self, night: str) -> list[str]:
+        """Return the sensors that at least half of the nights in the month before a night have."""
+        dates = {*nights_in(self.dataset), *self.staged}.intersection(nights_before(night, MONTH))
+        before = [row for date in sorted(dates) if (row := self._row(date)) is not None]
+        nights = Counter(name for row in before for name in row["sensor_ids"])
+        return sorted(name for name, count in nights.items() if 2 * count >= len(before))
+
     def key(self, night: str, settings: Settings) -> str:
         """Return a digest of what the nights were made from that the other methods read."""
-        made_from = {
-            date: self._read(date, partial(night_row, night=date))
-            for date in self._dates(night, settings)
-        }
-        return digest_of(f"{date} {key_of(row)}" for date, row in made_from.items())
+        made_from = [f"{d} {key_of(self._row(d))}" for d in self._dates(night, settings)]
+        usual = [] if settings.sensors.expected is not None else self.usual_sensors(night)
+        return digest_of([*made_from, *usual])
+
+    def _row(self, night: str) -> dict[str, Any] | None:
+        if night not in self._rows:
+            self._rows[night] = self._read(night, partial(night_row, night=night))
+        return self._rows[night]
 
     def _read(self, night: str, read: Callable[[str], T | None]) -> T | None:
         """Return what is read of an earlier night; None where it cannot be read.
@@ -218,12 +232,17 @@ def published_nights(dataset: str, settings: Settings, known: str | None) -> lis
         Digest of the catalogue of known objects that a run would have. None: whatever each night
         was made with.
     """
-    return [published_night(dataset, date, settings, known) for date in nights_in(dataset)]
+    earlier = EarlierNights(dataset, {})
+    return [
+        published_night(dataset, date, settings, known, earlier=earlier)
+        for date in nights_in(dataset)
+    ]
 
 
 def published_night(
-    dataset: str, date: str, settings: Settings, known: str | None, given: FoundLogs | None = None
-) -> PublishedNight:
+    dataset: str, date: str, settings: Settings, known: str | None,
+    given: FoundLogs | None = None, earlier: EarlierNights | None = None,
+) -> PublishedNight:  # fmt: skip
     """Return a night as `published_nights` does; with the logs of a run they are compared too.
 
     A night of which a log is not among these cannot be made: its logs are not compared.
@@ -243,7 +262,8 @@ def published_night(
     ]
     if given and made and night_logs_key(given, date, *made) != row["logs_key"]:
         stale.append("other logs")
-    if row["earlier_key"] != EarlierNights(dataset, {}).key(date, settings):
+    earlier = earlier or EarlierNights(dataset, {})
+    if row["earlier_key"] != earlier.key(date, settings):
         stale.append("another night before")
     return PublishedNight(date, row, stale + [f"no table {name}" for name in missing])
 

@@ -18,7 +18,13 @@ from epipole.schemas.stages import Stage
 from epipole.schemas.tables import CHECKS
 from epipole.schemas.work_tables import EXPOSURES, ITRF, LOG_STATES
 from epipole.tasks.algorithms.constants import SECOND_NS
-from epipole.tasks.algorithms.log_checks.findings import LEFT_OUT_STATES, SOUND, WRONG, Finding
+from epipole.tasks.algorithms.log_checks.findings import (
+    FRAMES_ALL_NIGHT,
+    LEFT_OUT_STATES,
+    SOUND,
+    WRONG,
+    Finding,
+)
 from epipole.tasks.algorithms.log_checks.frames import (
     GPS_S,
     TAI_GPS_S,
@@ -26,6 +32,7 @@ from epipole.tasks.algorithms.log_checks.frames import (
     LogCamera,
     LogFrames,
     check_frames,
+    check_night,
 )
 from epipole.tasks.algorithms.log_checks.states import LogStates, check_states
 from epipole.tasks.common.batches import Batch
@@ -65,6 +72,17 @@ class SensorLog(NamedTuple):
     left_out: Mapping[str, int]
 
 
+class NightFrames(NamedTuple):
+    """The times [ns] of the first and the last frame of a night, of any sensor.
+
+    `max_gaps` is the largest share of the night in which a sensor may have no frames.
+    """
+
+    first_ns: int
+    last_ns: int
+    max_gaps: float
+
+
 class JudgedSensor(NamedTuple):
     """A sensor, and the parts of logs that have something of it."""
 
@@ -91,6 +109,7 @@ def judge_logs(
     rejects: pa.Table,
     between_ns: tuple[int, int],
     state_gap_s: float,
+    night: NightFrames | None = None,
 ) -> pa.Table:
     """Return CHECKS of sensors, by what the logs have of them between two times.
 
@@ -108,7 +127,21 @@ def judge_logs(
         )
         log = sensor_log(sensor, exposures, states, cameras, rejects, between_ns)
         found[sensor] = judge_sensor(log, state_gap_s)
+        if night is not None and (of_night := _of_night(log.time_ns, night)) is not None:
+            found[sensor].append(of_night)
     return checks_table(found)
+
+
+def _of_night(time_ns: Integers, night: NightFrames) -> Finding | None:
+    first_ns, last_ns, max_gaps = night
+    inside = np.unique(time_ns[(time_ns >= first_ns) & (time_ns <= last_ns)])
+    return check_night(inside, first_ns, last_ns, max_gaps)
+
+
+def absent_sensors(names: Iterable[str]) -> pa.Table:
+    """Return CHECKS of sensors that are expected and have no frames."""
+    found = Finding(FRAMES_ALL_NIGHT, WRONG, 1.0, expected=0.0, cause=LogCause.NO_FRAMES.value)
+    return checks_table({name: [found] for name in names})
 
 
 def sensor_log(
@@ -252,11 +285,16 @@ def sentence_of(found: Finding) -> str:
         **found.facts,
         "percent": 100 * found.value,
         "scale": _scale(found.facts.get("offset_s", 0.0)),
+        **{f"gap_{end}": _clock(found.facts.get(f"{end}_s", 0.0)) for end in ("from", "to")},
     }
     if cause is None:
         return LogCheck(found.check).sound.format(**numbers)
     evidence = cause.evidence.format(**numbers)
     return f"{evidence}; {cause.cure}" if cause.cure else evidence
+
+
+def _clock(time_s: float) -> str:
+    return str(np.datetime64(int(time_s), "s"))[11:]
 
 
 def _scale(offset_s: float) -> str:

@@ -167,12 +167,13 @@ class _SeriesSums:
             self._find_gaps(k, time_ns[sensor == k])
 
     def _find_gaps(self, k: int, time_ns: Indices) -> None:
-        if self.last_ns[k] >= 0:
-            time_ns = np.concatenate([self.last_ns[k : k + 1], time_ns])
+        first = int(self.last_ns[k] < 0)
+        before = self.bins.start_ns if first else self.last_ns[k]
+        time_ns = np.concatenate([[before], time_ns])
         self.last_ns[k] = time_ns[-1]
         steps = np.diff(time_ns)
-        if not self.interval_ns[k] and len(steps):
-            self.interval_ns[k] = np.median(steps)
+        if not self.interval_ns[k] and len(inner := steps[first:]):
+            self.interval_ns[k] = np.median(inner)
         longest = max(GAP_FRAMES * self.interval_ns[k], SHORTEST_GAP_S * 1e9)
         for i in np.flatnonzero(steps > longest).tolist():
             self.lost_s[k] += steps[i] / 1e9
@@ -181,7 +182,9 @@ class _SeriesSums:
             self.gaps = sorted(self.gaps, key=lambda gap: -gap.seconds)[:MAX_GAPS]
 
     def result(self) -> FrameSeries:
-        """Return the series."""
+        """Return the series; a gap may last to the end of the night."""
+        for k in range(len(self.sensors)):
+            self._find_gaps(k, np.array([self.bins.end_ns - 1]))
         with np.errstate(invalid="ignore", divide="ignore"):
             rms = {name: np.sqrt(self.squares[name] / self.numbers[name]) for name in SUMS}
             stars = self.stars / self.counts[0].sum(axis=1)

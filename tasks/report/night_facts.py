@@ -192,7 +192,6 @@ def _concerned(
 # What needs a look, as sentences; none where all is well.
 
 MIN_IDENTIFIED = 0.9  # share of a sensor's frames
-LONGEST_LOST = 0.02  # share of the night
 # A mean square over what it should be: sigmas are a fifth too large, or too small.
 LOWEST, HIGHEST = 0.7, 1.4
 MIN_VALUES = 30  # independent values: with fewer, noise alone exceeds the bounds
@@ -236,15 +235,11 @@ def _sensors(facts: NightFacts) -> Iterator[Look]:
     series = facts.series
     if series is None:
         return
-    length_s = (series.bins.end_ns - series.bins.start_ns) / 1e9
     for k, name in enumerate(series.sensors):
         share = series.identified_share[k]
         if share < MIN_IDENTIFIED:
             identified = f"{percent(share)} of its frames are identified{_why(series, name)}"
             yield Look(f"{name}: {identified}.", _frame_of(facts, name, "coverage"))
-        if series.lost_s[k] > LONGEST_LOST * length_s:
-            lost = duration(series.lost_s[k])
-            yield Look(f"{name} has no frames for {lost} of the night (gaps).", "coverage")
 
 
 def _frame_of(facts: NightFacts, name: str, otherwise: str) -> str:

@@ -26,14 +26,18 @@ PLAIN = validate_settings({"report": {"write": False}}, "test")
 pytestmark = pytest.mark.usefixtures("prefect")
 
 
-def write_log(path: Path, day: str, n_frames: int = 10) -> Path:
-    """Write a log of a sensor without stars, from four in the morning, a chunk for each frame."""
+def write_log(path: Path, day: str, n_frames: int = 10, **others: int) -> Path:
+    """Write a log of sensors without stars, from four in the morning, a chunk for each frame.
+
+    `others` are sensors beside `a`, with their numbers of frames.
+    """
     start_ns = int(np.datetime64(f"{day}T04:00", "ns").astype(np.int64))
     with LogWriter(path, chunk_size=1, compression="none") as log:
-        log.camera("a", start_ns, OPTICS)
-        for k in range(n_frames):
-            t = start_ns + k * SECOND_NS
-            log.frame("a", t, frame_number=k, exposure_s=0.1, x_px=[1.0], y_px=[2.0])
+        for sensor, count in {"a": n_frames, **others}.items():
+            log.camera(sensor, start_ns, OPTICS)
+            for k in range(count):
+                t = start_ns + k * SECOND_NS
+                log.frame(sensor, t, frame_number=k, exposure_s=0.1, x_px=[1.0], y_px=[2.0])
     return path
 
 
@@ -120,3 +124,23 @@ def test_what_is_wrong_with_a_night_before_does_not_stop_the_one_asked_for(tmp_p
     assert summary.unchanged
     (sentence,) = summary.earlier
     assert f"was also made from {DAYS[0]}.mcap" in sentence
+
+
+def test_sensors_that_are_absent_or_stop_early_are_named(tmp_path):
+    folder, out = tmp_path / "logs", tmp_path / "out"
+    folder.mkdir()
+    write_log(folder / "first.mcap", DAYS[0], 60, b=60, c=58)
+    write_log(folder / "second.mcap", DAYS[1], 60, b=30)
+    first, second = (nightly(str(folder), str(out), PLAIN, night=day) for day in DAYS)
+    assert [s for s in first.mistakes if "no frames" in s] == []
+    assert [s for s in second.mistakes if "no frames" in s] == [
+        "b: no frames for 30 s of the 59 s of the night, the longest time from 04:00:29 to "
+        "04:00:59 UTC",
+        "c: no frames in the whole night",
+    ]
+    (row,) = read_table(out, "nights", DAYS[1]).to_pylist()
+    assert row["sensor_ids"] == ["a", "b"]
+    assert unchanged(folder, out, DAYS[1]) == [DAYS[1]]
+    told = validate_settings({"sensors": {"expected": ["a", "d"], "max_gaps": 1.0}}, "test")
+    third = nightly(str(folder), str(out), told, night=DAYS[1])
+    assert [s for s in third.mistakes if "no frames" in s] == ["d: no frames in the whole night"]

@@ -10,6 +10,7 @@ from epipole.tasks.algorithms.log_checks.findings import (
     COVERAGE,
     FLUX,
     FRAME_TIMES,
+    FRAMES_ALL_NIGHT,
     IMAGE_SIZE,
     ONE_SENSOR,
     PRINCIPAL_POINT,
@@ -34,6 +35,8 @@ MIN_FRAMES = 20
 MIN_REPEATED = 0.2  # share of the frames whose time is that of another one
 MIN_BACKWARD = 0.2  # share of the steps at which the frame number does not grow
 MIN_FLUXES = 50
+GAP_FRAMES = 10  # a time without frames that is this many frame intervals long is a gap
+SHORTEST_GAP_S = 5.0
 MAGNITUDES = (-5.0, 20.0)
 # Where the median lies between the smallest and the largest: faint stars are many. Half of them
 # are within a magnitude of the limit; of linear fluxes the median is near the smallest.
@@ -154,6 +157,40 @@ def check_coverage(
     if near < 0.9:
         return [found._replace(verdict=UNKNOWN, cause="few_states_near")]
     return [found]
+
+
+def check_night(
+    time_ns: Nanoseconds, start_ns: int, end_ns: int, longest_lost: float
+) -> Finding | None:
+    """Return whether a sensor has frames all night, between the first and the last of any sensor.
+
+    A gap is a time of `GAP_FRAMES` frame intervals, and of at least `SHORTEST_GAP_S`; also one at
+    an end of the night.
+
+    Parameters
+    ----------
+    time_ns
+        (n,) times of its frames, in order; None is returned without any.
+    longest_lost
+        Largest share of the night that gaps may take.
+    """
+    if not len(time_ns) or end_ns <= start_ns:
+        return None
+    ends = np.concatenate([[start_ns], time_ns, [end_ns]])
+    steps = np.diff(ends)
+    inner = steps[1:-1]
+    usual = float(np.median(inner)) if len(inner) else 0.0
+    gaps = np.where(steps > max(GAP_FRAMES * usual, SHORTEST_GAP_S * SECOND_NS), steps, 0)
+    lost, length = float(gaps.sum()), float(end_ns - start_ns)
+    found = Finding(FRAMES_ALL_NIGHT, SOUND, lost / length, expected=0.0)
+    if lost <= longest_lost * length:
+        return found
+    longest = int(np.argmax(gaps))
+    facts = {
+        "lost_s": lost / SECOND_NS, "length_s": length / SECOND_NS,
+        "from_s": float(ends[longest] // SECOND_NS), "to_s": float(ends[longest + 1] // SECOND_NS),
+    }  # fmt: skip
+    return found._replace(verdict=WRONG, cause="long_gaps", facts=facts)
 
 
 def known_offset(shift_s: float) -> float:

@@ -36,6 +36,17 @@ def test_a_time_without_frames_is_a_gap():
     assert series.lost_s.tolist() == [101]
 
 
+def test_a_sensor_that_begins_late_and_stops_early_has_gaps_at_both_ends():
+    time = seconds(100)
+    rows = [(t, s) for k, t in enumerate(time) for s in ("a", "b") if s == "a" or 20 <= k < 70]
+    frames = filled("frames", time=[t for t, _ in rows], sensor_id=[s for _, s in rows],
+                    attitude_source=["none"] * len(rows))  # fmt: skip
+    for in_group in (7, 1000):
+        series = read_frame_series(reader_of({"frames": frames}, in_group=in_group))
+        assert [(gap.sensor_id, gap.seconds) for gap in series.gaps] == [("b", 20), ("b", 30)]
+        assert series.lost_s.tolist() == [0, 50]
+
+
 def test_sigmas_are_root_mean_squares():
     series = read_frame_series(night())
     assert np.nanmax(abs(series.rms["across"] - np.sqrt(12.5))) < 1e-12

@@ -11,6 +11,7 @@ from epipole.tasks.algorithms.log_checks.frames import (
     check_flux,
     check_frames,
     check_image_size,
+    check_night,
     check_numbers,
     check_principal_point,
     check_times,
@@ -18,6 +19,7 @@ from epipole.tasks.algorithms.log_checks.frames import (
 )
 
 START_NS = 1_554_091_200_000_000_000
+SECOND_NS = 1_000_000_000
 CAMERA = LogCamera(1024, 800, 1000.0, 1000.0, 511.0, 400.0, 0)
 
 
@@ -128,3 +130,22 @@ def test_magnitudes_are_no_fluxes():
 
 def test_no_frames_have_no_findings():
     assert check_frames(frames([]), ns(np.arange(5)), CAMERA, 10.0) == []
+
+
+@pytest.mark.parametrize(
+    ("kept", "lost", "longest"),
+    [
+        (slice(0, 107), 180, (106, 286)),  # it stops
+        (slice(107, None), 107, (0, 107)),  # it begins late
+        (np.r_[0:50, 90:287], 41, (49, 90)),
+        (slice(None, None, 9), 0, None),  # slow, but all night
+    ],
+)
+def test_a_sensor_without_frames_for_a_part_of_the_night_is_found(kept, lost, longest):
+    time_ns = np.arange(287) * SECOND_NS
+    found = check_night(time_ns[kept], 0, int(time_ns[-1]), 0.02)
+    assert abs(found.value - lost / 286) < 1e-9
+    assert found.verdict == ("wrong" if lost else "sound")
+    if longest:
+        assert (found.facts["from_s"], found.facts["to_s"]) == longest
+    assert check_night(time_ns[:0], 0, int(time_ns[-1]), 0.02) is None
