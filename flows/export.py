@@ -1,15 +1,18 @@
-"""Export a night's objects as messages for orbit determination: CCSDS TDM, OEM and OPM."""
+"""Export a night's objects as messages for orbit determination: CCSDS TDM, OEM, OPM and OCM."""
 
 import shutil
 import tempfile
 from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
+from typing import NamedTuple
 
 import polars as pl
 
 from epipole.io.ccsds import (
     Directions,
+    Ephemeris,
     Subject,
+    comprehensive_message,
     ephemeris_message,
     safe_name,
     state_message,
@@ -20,10 +23,11 @@ from epipole.io.datasets.dataset import nights_in, read_table
 from epipole.io.paths import fault_of_name
 from epipole.schemas.bridge import to_polars
 from epipole.schemas.errors import DatasetError
-from epipole.schemas.options import Message
+from epipole.schemas.options import Message, MessageFrame
 from epipole.tasks.export import (
     arcs,
     directions,
+    in_frame,
     orbit_arc,
     sensor_ephemeris,
     single_orbit,
@@ -32,24 +36,39 @@ from epipole.tasks.export import (
 )
 from epipole.tasks.publish.object_orbits import noon_ns, surroundings_of
 
+HOUR_NS = 3_600_000_000_000
+
 OF_STATE = "State of an object, fitted to its lines of sight; covariance in the same frame."
 OF_ARC = "A fitted state, moved through its arc: point mass and J2; not to be extrapolated."
 OF_ORBIT = "Orbit fitted to all observations of the night; covariance in the same frame."
 OF_FORCES = "Forces of the fit, by which it is moved:"
+OF_AHEAD = "It goes on after its arc: errors of the forces are not in the covariance."
 OF_SENSOR = "The sensor's positions and velocities at its frames, from its log."
 
 
-def export(
-    kind: Message, dataset: str, night: str, out: Path, object_ids: Sequence[str] = ()
-) -> list[str]:
+class Wanted(NamedTuple):
+    """What is asked for of a night; no ids: all objects.
+
+    `ahead_h` hours after its arc an orbit goes on, in an OEM or OCM.
+    """
+
+    object_ids: Sequence[str] = ()
+    frame: MessageFrame = MessageFrame.GCRF
+    ahead_h: float = 0.0
+
+
+ALL = Wanted()
+
+
+def export(kind: Message, dataset: str, night: str, out: Path, wanted: Wanted = ALL) -> list[str]:
     """Write messages of the objects of a night into an empty folder, all of them or none.
 
     Returns
     -------
     list of str
         The names of the files: of TDMs one per object, one per sensor with its tracklets that
-        belong to none, and an ephemeris per sensor; of OEMs one per object; of OPMs one per
-        orbit, or per state of an object without orbit.
+        belong to none, and an ephemeris per sensor; of OEMs one per object; of OPMs and OCMs one
+        per orbit, or per state of an object without orbit.
 
     Raises
     ------
@@ -62,9 +81,9 @@ def export(
     tables = _NightTables(dataset, night)
     with tempfile.TemporaryDirectory(prefix=".export-", dir=_parent(out)) as made:
         if kind == Message.tdm:
-            _write_tracking_data(tables, object_ids, Path(made))
+            _write_tracking_data(tables, wanted.object_ids, Path(made))
         else:
-            _write_states(kind, tables, object_ids, Path(made))
+            _write_states(kind, tables, wanted, Path(made))
         files = sorted(path.name for path in Path(made).iterdir())
         if not files:
             raise DatasetError(f"{dataset}: the night {night} has no {kind.table} to export")
@@ -127,35 +146,44 @@ def _write_tracking_data(night: _NightTables, wanted: Sequence[str], folder: Pat
         write_message(folder / file, tracking_data(segments[name]))
 
 
-def _write_states(kind: Message, night: _NightTables, wanted: Sequence[str], folder: Path) -> None:
+def _write_states(kind: Message, night: _NightTables, wanted: Wanted, folder: Path) -> None:
     """Write the orbit of each object; without one, its states."""
     rows = night.read("orbits").with_columns(epoch_ns=pl.col("epoch").dt.epoch("ns"))
     orbits = {row["object_id"]: row for row in rows.drop("epoch").iter_rows(named=True)}
     states = night.by_id(night.read("states"), "object_id")
-    night.check(kind.table, wanted, {*orbits, *states})
-    names = wanted or sorted({*orbits, *states})
-    around, origin_ns = surroundings_of(night.night), noon_ns(night.night)
-    positions = night.read("positions") if kind == Message.oem else pl.DataFrame()
+    night.check(kind.table, wanted.object_ids, {*orbits, *states})
+    names = wanted.object_ids or sorted({*orbits, *states})
+    moved = kind != Message.opm
+    around = surroundings_of(night.night, round(wanted.ahead_h * HOUR_NS))
+    origin_ns = noon_ns(night.night)
+    positions = night.read("positions") if moved else pl.DataFrame()
     for name, file in _file_names(names, kind.value).items():
-        path, of = folder / file, night.subject(name)
         orbit = orbits.get(name)
-        if kind == Message.oem:
-            if orbit is not None:
-                comments = [OF_ORBIT, OF_FORCES, orbit["forces"]]
-                parts = [orbit_arc(orbit, around, origin_ns)]
-            else:
-                comments = [OF_ARC]
-                parts = arcs(states[name], positions.filter(pl.col("object_id") == name))
-            write_message(path, ephemeris_message(of, parts, comments))
-            continue
         if orbit is not None:
             comments = [OF_ORBIT, OF_FORCES, orbit["forces"]]
-            parts = [single_orbit(orbit)]
+            ahead_s = wanted.ahead_h * 3600
+            parts = [orbit_arc(orbit, around, origin_ns, ahead_s) if moved else single_orbit(orbit)]
+            comments += [OF_AHEAD] if moved and ahead_s else []
+        elif moved:
+            comments = [OF_ARC]
+            parts = arcs(states[name], positions.filter(pl.col("object_id") == name))
         else:
             comments, parts = [OF_STATE], single_states(states[name].sort("epoch"))
-        for number, part in enumerate(parts, 1):
-            numbered = path.with_name(f"{path.stem}-{number}{path.suffix}")
-            write_message(numbered, state_message(of, part, comments))
+        parts = [in_frame(part, wanted.frame.value) for part in parts]
+        _write_parts(kind, folder / file, night.subject(name), parts, comments)
+
+
+def _write_parts(
+    kind: Message, path: Path, of: Subject, parts: Sequence[Ephemeris], comments: Sequence[str]
+) -> None:
+    """Write an OEM of all parts, or a numbered OPM or OCM of each."""
+    if kind == Message.oem:
+        write_message(path, ephemeris_message(of, parts, comments))
+        return
+    message = state_message if kind == Message.opm else comprehensive_message
+    for number, part in enumerate(parts, 1):
+        numbered = path.with_name(f"{path.stem}-{number}{path.suffix}")
+        write_message(numbered, message(of, part, comments))
 
 
 def _file_names(names: Sequence[str], ending: str) -> Mapping[str, str]:

@@ -1,4 +1,4 @@
-"""CCSDS messages for orbit determination: OEM and OPM (502.0-B-3), TDM (503.0-B-2); in GCRF."""
+"""CCSDS messages for orbit determination: OEM, OPM and OCM (502.0-B-3), TDM (503.0-B-2)."""
 
 import datetime
 import re
@@ -54,7 +54,7 @@ def write_message(path: Path, text: str) -> None:
         raise DatasetError(f"{path}: cannot be written ({error.strerror})") from error
 
 
-# Ephemerides (OEM) and single states (OPM).
+# Ephemerides (OEM, OCM) and single states (OPM).
 
 Array = npt.NDArray[np.float64]
 
@@ -92,16 +92,19 @@ class Ephemeris(NamedTuple):
 
     time_ns : (n,) int, UTC
     state : (n, 6) float
-        Position [km] and velocity [km/s], GCRF.
+        Position [km] and velocity [km/s].
     covariance_ns : (m,) int
         Times of the covariances, UTC.
     covariance : (m, 6, 6) float
+    frame
+        Of states and covariances.
     """
 
     time_ns: npt.NDArray[np.int64]
     state: Array
     covariance_ns: npt.NDArray[np.int64]
     covariance: Array
+    frame: str = "GCRF"
 
 
 def ephemeris_message(of: Subject, parts: Sequence[Ephemeris], comments: Sequence[str]) -> str:
@@ -118,7 +121,7 @@ def _ephemeris_segment(of: Subject, part: Ephemeris, comments: Sequence[str]) ->
         at[0],
         at[-1],
         center_name="EARTH",
-        ref_frame="GCRF",
+        ref_frame=part.frame,
         time_system="UTC",
         interpolation="HERMITE",
         interpolation_degree=int(min(DEGREE, max(len(at) - 1, 1))),
@@ -130,7 +133,7 @@ def _ephemeris_segment(of: Subject, part: Ephemeris, comments: Sequence[str]) ->
     ]
     lower = np.tril_indices(6)
     covariances = [
-        ccsds.OemCovarianceMatrix(epoch, matrix[lower], None, [])
+        ccsds.OemCovarianceMatrix(epoch, matrix[lower], part.frame, [])
         for epoch, matrix in zip(times(part.covariance_ns), part.covariance, strict=True)
     ]
     return ccsds.OemSegment(metadata, ccsds.OemData(states, covariances))
@@ -139,8 +142,8 @@ def _ephemeris_segment(of: Subject, part: Ephemeris, comments: Sequence[str]) ->
 def state_message(of: Subject, part: Ephemeris, comments: Sequence[str]) -> str:
     """Return the OPM of one state, with its covariance."""
     metadata = ccsds.OpmMetadata(
-        of.message_name, of.message_id, center_name="EARTH", ref_frame="GCRF", time_system="UTC",
-        comment=[*of.comments(), *comments],
+        of.message_name, of.message_id, center_name="EARTH", ref_frame=part.frame,
+        time_system="UTC", comment=[*of.comments(), *comments],
     )  # fmt: skip
     (epoch,) = times(part.time_ns)
     data = ccsds.OpmData(ccsds.StateVector(epoch, *np.round(part.state[0], 9).tolist()))
@@ -151,6 +154,34 @@ def state_message(of: Subject, part: Ephemeris, comments: Sequence[str]) -> str:
         }
     )
     return str(ccsds.Opm(_header(), ccsds.OpmSegment(metadata, data)).to_str("kvn"))
+
+
+def comprehensive_message(of: Subject, part: Ephemeris, comments: Sequence[str]) -> str:
+    """Return the OCM of one object: its ephemeris, with the covariance of each state."""
+    at = times(part.time_ns)
+    metadata = ccsds.OcmMetadata(
+        time_system="UTC", epoch_tzero=at[0], object_name=of.message_name,
+        international_designator=None if of.cospar_id is None else safe_name(of.cospar_id),
+        catalog_name=None if of.norad_id is None else "SATCAT",
+        object_designator=safe_name(of.subject_id) if of.norad_id is None else f"{of.norad_id}",
+        start_time=at[0], stop_time=at[-1], comment=[*of.comments(), *comments],
+    )  # fmt: skip
+    lines = zip(at, np.round(part.state, 9).tolist(), strict=True)
+    trajectory = ccsds.OcmTrajState(
+        center_name="EARTH", traj_ref_frame=part.frame, traj_type="CARTPV",
+        traj_basis="DETERMINED", interpolation="HERMITE",
+        interpolation_degree=int(min(DEGREE, max(len(at) - 1, 1))),
+        traj_lines=[ccsds.TrajLine(epoch=epoch, values=values) for epoch, values in lines],
+    )  # fmt: skip
+    lower = np.tril_indices(6)
+    matrices = zip(times(part.covariance_ns), part.covariance, strict=True)
+    covariance = ccsds.OcmCovarianceMatrix(
+        cov_ref_frame=part.frame, cov_type="CARTPV", cov_ordering="LTM", cov_basis="DETERMINED",
+        cov_lines=[ccsds.CovLine(epoch=e, values=matrix[lower].tolist()) for e, matrix in matrices],
+    )  # fmt: skip
+    data = ccsds.OcmData()
+    data.traj, data.cov = [trajectory], [covariance]
+    return str(ccsds.Ocm(_header(), ccsds.OcmSegment(metadata, data)).to_str("kvn"))
 
 
 def _header() -> ccsds.OdmHeader:

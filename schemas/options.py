@@ -109,13 +109,22 @@ class Runner(StrEnum):
 
 
 class Message(StrEnum):
-    """A kind of CCSDS message: tracking data, an ephemeris, a state."""
+    """A kind of CCSDS message: tracking data, an ephemeris, a state, an ephemeris and who it is."""
 
     tdm = "tdm"
     oem = "oem"
     opm = "opm"
+    ocm = "ocm"
 
     @property
     def table(self) -> str:
         """The tables that it is made from."""
         return "observations" if self is Message.tdm else "orbits or states"
+
+
+class MessageFrame(StrEnum):
+    """The reference frame of states in messages."""
+
+    GCRF = "GCRF"
+    EME2000 = "EME2000"
+    ITRF = "ITRF"

@@ -1,4 +1,4 @@
-"""Tables of a night for CCSDS messages: directions by sensor, states and ephemerides."""
+"""Tables of a night for CCSDS messages: directions by sensor, states and ephemerides in a frame."""
 
 import re
 from collections.abc import Mapping
@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import polars as pl
 
+from epipole.io.catalogues.earth_orientation import read_earth_orientation
 from epipole.io.ccsds import Directions, Ephemeris, Subject
 from epipole.schemas.bridge import stack_covariance
 from epipole.schemas.columns import POSITION, STATE_AXES, VELOCITY
@@ -15,7 +16,11 @@ from epipole.tasks.algorithms.constants import SECOND_NS, SPEED_OF_LIGHT_KM_S
 from epipole.tasks.algorithms.geometry.directions import radec_from_unit, unit_from_radec
 from epipole.tasks.algorithms.orbits.forces import Surroundings
 from epipole.tasks.algorithms.orbits.orbit_fit import trajectory
-from epipole.tasks.algorithms.orbits.reference_frames import EME2000_FROM_GCRF
+from epipole.tasks.algorithms.orbits.reference_frames import (
+    EME2000_FROM_GCRF,
+    from_gcrf,
+    orientation_at,
+)
 from epipole.tasks.algorithms.orbits.trajectories import propagate_unknowns
 from epipole.tasks.publish.object_orbits import DRAG, RADIATION
 
@@ -90,6 +95,20 @@ def sensor_ephemeris(frames: pl.DataFrame) -> Ephemeris:
     )
 
 
+def in_frame(of: Ephemeris, frame: str) -> Ephemeris:
+    """Return an ephemeris in GCRF with its covariances in another of `MESSAGE_FRAMES`."""
+    if frame == of.frame:
+        return of
+    table = read_earth_orientation()
+    turn, covariance_turn = (
+        from_gcrf(frame, time_ns, orientation_at(time_ns, *table))
+        for time_ns in (of.time_ns, of.covariance_ns)
+    )
+    state = np.einsum("nij,nj->ni", turn, of.state)
+    covariance = covariance_turn @ of.covariance @ np.swapaxes(covariance_turn, 1, 2)
+    return Ephemeris(of.time_ns, state, of.covariance_ns, covariance, frame)
+
+
 # The orbit of an object, moved through its arc under the forces that it was fitted with.
 
 STEPS = 60  # of an arc, at least
@@ -111,22 +130,30 @@ def single_orbit(orbit: Mapping[str, Any]) -> Ephemeris:
     return Ephemeris(time_ns, state, time_ns, covariance)
 
 
-def orbit_arc(orbit: Mapping[str, Any], around: Surroundings, origin_ns: int) -> Ephemeris:
+def orbit_arc(
+    orbit: Mapping[str, Any], around: Surroundings, origin_ns: int, ahead_s: float = 0.0
+) -> Ephemeris:
     """Return the ephemeris of a row of ORBITS over its arc, with the covariance of each state.
 
-    `around` counts from `origin_ns`.
+    Parameters
+    ----------
+    around
+        Counts from `origin_ns`.
+    ahead_s
+        How long after the arc it goes on. The covariance is that of the fit, moved: errors of the
+        forces are not in it.
     """
     half_s = max(orbit["arc_s"] / 2, 1.0)
-    steps = max(STEPS // 2, int(np.ceil(half_s / MAX_STEP_S)))
     epoch_s = (orbit["epoch_ns"] - origin_ns) / SECOND_NS
     R = np.kron(np.eye(2), around.R_night_from_gcrf)
     of = single_orbit(orbit)
     start = np.concatenate([R @ of.state[0], areas_in(orbit["forces"])])
     found: list[tuple[float, np.ndarray, np.ndarray]] = []
-    for direction in (-1, 1):
+    for end_s in (-half_s, half_s + ahead_s):
         unknowns, transition = start, np.eye(len(start))
+        steps = max(STEPS // 2, int(np.ceil(abs(end_s) / MAX_STEP_S)))
         for k in range(1, steps + 1):
-            before, at = (direction * half_s * step / steps for step in (k - 1, k))
+            before, at = (end_s * step / steps for step in (k - 1, k))
             unknowns, moved = propagate_unknowns(unknowns, epoch_s + before, epoch_s + at, around)
             transition = moved @ transition
             turned = R.T @ transition[:6, :6] @ R
@@ -135,8 +162,7 @@ def orbit_arc(orbit: Mapping[str, Any], around: Surroundings, origin_ns: int) ->
     found.sort(key=lambda each: each[0])
     at_s, states, covariances = zip(*found, strict=True)
     time_ns = orbit["epoch_ns"] + np.rint(np.array(at_s) * SECOND_NS).astype(np.int64)
-    chosen = [0, steps, 2 * steps]
-    return Ephemeris(time_ns, np.array(states), time_ns[chosen], np.array(covariances)[chosen])
+    return Ephemeris(time_ns, np.array(states), time_ns, np.array(covariances))
 
 
 # Objects without an orbit: each state, moved through the arc that it was fitted to.
@@ -158,8 +184,8 @@ def single_states(states: pl.DataFrame) -> list[Ephemeris]:
 def arcs(states: pl.DataFrame, positions: pl.DataFrame) -> list[Ephemeris]:
     """Return an ephemeris for each of the STATES of one object, in order of time.
 
-    It covers the object's POSITIONS about the state's epoch: point mass and J2 from there, and the
-    covariance at the epoch and at both ends.
+    It covers the object's POSITIONS about the state's epoch: point mass and J2 from there, with the
+    covariance of each state.
     """
     seen_ns = positions["epoch"].dt.epoch("ns").to_numpy()
     return [_arc(state, seen_ns) for state in single_states(states.sort("epoch"))]
@@ -177,6 +203,5 @@ def _arc(of: Ephemeris, seen_ns: np.ndarray) -> Ephemeris:
     state, transition = trajectory(of.state[0], at_s)
     order = np.argsort(at_s, kind="stable")
     time_ns = epoch_ns + np.rint(at_s * SECOND_NS).astype(np.int64)
-    chosen = order[[0, int(np.flatnonzero(order == 0)[0]), -1]]
-    covariance = transition[chosen] @ of.covariance[0] @ np.swapaxes(transition[chosen], 1, 2)
-    return Ephemeris(time_ns[order], state[order], time_ns[chosen], covariance)
+    covariance = transition @ of.covariance[0] @ np.swapaxes(transition, 1, 2)
+    return Ephemeris(time_ns[order], state[order], time_ns[order], covariance[order])

@@ -22,7 +22,7 @@ from epipole.flows.command_line.options import (
 )
 from epipole.flows.prefect.server_process import new_secret
 from epipole.schemas.errors import EpipoleError
-from epipole.schemas.options import STAR_CATALOGUES, Message
+from epipole.schemas.options import STAR_CATALOGUES, Message, MessageFrame
 
 
 def report(
@@ -218,8 +218,11 @@ def evaluate(
         show(report)
 
 
+MAX_AHEAD_H = 21 * 24.0  # services that screen ephemerides take 21 days
+
+
 def export(
-    message: Annotated[Message, typer.Argument(metavar="KIND", help="tdm, oem or opm.")],
+    message: Annotated[Message, typer.Argument(metavar="KIND", help="tdm, oem, opm or ocm.")],
     dataset: Annotated[
         str,
         typer.Argument(metavar="DATASET", help="Folder or URL that `epipole run` published to."),
@@ -234,6 +237,19 @@ def export(
             help="Only this object, or tracklet of a tdm; may be given again.",
         ),
     ] = None,
+    frame: Annotated[
+        MessageFrame, typer.Option(help="Reference frame of states and covariances; not of a tdm.")
+    ] = MessageFrame.GCRF,
+    ahead_h: Annotated[
+        float,
+        typer.Option(
+            "--ahead",
+            min=0.0,
+            max=MAX_AHEAD_H,
+            metavar="HOURS",
+            help="How long orbits go on after their arc, in an oem or ocm.",
+        ),
+    ] = 0.0,
     as_json: AsJson = False,
 ) -> None:
     """Write a night's objects as CCSDS messages for orbit determination (KVN).
@@ -244,11 +260,13 @@ def export(
     oem: each object's orbit, or its states, moved through its arc (OEM 3.0)
 
     opm: each orbit, or state, with its covariance (OPM 3.0)
+
+    ocm: as oem, with the numbers of a catalogue (OCM 3.0)
     """
-    from epipole.flows.export import export
+    from epipole.flows.export import Wanted, export
 
     check_night(night)
-    files = export(message, dataset, night, out, object_ids or ())
+    files = export(message, dataset, night, out, Wanted(object_ids or (), frame, ahead_h))
     if as_json:
         print_json({"folder": str(out), "files": files})
     else:

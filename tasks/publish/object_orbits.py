@@ -58,13 +58,16 @@ class Start(NamedTuple):
     state: Array
 
 
-def surroundings_of(night: str) -> Surroundings:
-    """Return what acts on satellites in a night and half a day around it; times from its noon."""
+def surroundings_of(night: str, ahead_ns: int = 0) -> Surroundings:
+    """Return what acts on satellites in a night and half a day around it; times from its noon.
+
+    `ahead_ns` is how much later it ends.
+    """
     noon = noon_ns(night)
     earth = read_earth_orientation()
     days = np.datetime64(night, "D") - np.datetime64("1858-11-17", "D")
     ut1_utc_s = float(np.interp(days.astype(float), earth.mjd, earth.ut1_utc_s))
-    return surroundings(noon, noon - DAY_NS, noon + DAY_NS, ut1_utc_s)
+    return surroundings(noon, noon - DAY_NS, noon + DAY_NS + ahead_ns, ut1_utc_s)
 
 
 def noon_ns(night: str) -> int:

@@ -7,10 +7,13 @@ import numpy as np
 import polars as pl
 import pyarrow.parquet as pq
 import pytest
+from scenes.screening import faults_of
 
-from epipole.flows.export import export
+from epipole.flows.export import Wanted, export
+from epipole.io.catalogues.earth_orientation import read_earth_orientation
 from epipole.schemas.errors import DatasetError
-from epipole.schemas.options import Message
+from epipole.schemas.options import Message, MessageFrame
+from epipole.tasks.algorithms.orbits.reference_frames import orientation_at, to_gcrf
 
 NIGHT = "2019-04-01"
 
@@ -69,7 +72,7 @@ def test_orbits_are_messages_of_their_own_and_ephemerides_of_their_arcs(night_da
     assert covariance.cz_dot_x == pytest.approx(row["cov_xvz"], rel=1e-9)
     (segment,) = ccsds.Oem.from_file(str(tmp_path / "oem" / oem[0])).segments
     assert row["forces"] in list(segment.metadata.comment)
-    assert len(segment.data.covariance_matrix) == 3
+    assert len(segment.data.covariance_matrix) == len(segment.data.state_vector)
 
 
 def test_an_object_without_an_orbit_is_exported_by_its_states(night_dataset, tmp_path):
@@ -78,8 +81,8 @@ def test_an_object_without_an_orbit_is_exported_by_its_states(night_dataset, tmp
         night_dataset, tmp_path / "ds", orbits=lambda rows: rows.filter(pl.col("object_id") != name)
     )
     states = observed(night_dataset, "states").filter(object_id=name).sort("epoch")
-    opm = export(Message.opm, out, NIGHT, tmp_path / "opm", [name])
-    oem = export(Message.oem, out, NIGHT, tmp_path / "oem", [name])
+    opm = export(Message.opm, out, NIGHT, tmp_path / "opm", Wanted([name]))
+    oem = export(Message.oem, out, NIGHT, tmp_path / "oem", Wanted([name]))
     assert (len(opm), len(oem)) == (len(states), 1)
     state = ccsds.Opm.from_file(str(tmp_path / "opm" / opm[0])).segment.data.state_vector
     assert state.x == pytest.approx(states["x_km"][0], abs=1e-9)
@@ -114,18 +117,18 @@ def test_tracklets_without_object_are_in_the_message_of_their_sensor(night_datas
     comments = {s.metadata.participant_2: next(iter(s.metadata.comment)) for s in segments}
     assert comments[lone[0]] == f"ID {lone[0]}, NORAD 7, NAME SAT 7"
     assert comments[lone[1]].startswith("Astrometric directions")
-    one = export(Message.tdm, out, NIGHT, tmp_path / "one", [lone[0]])
+    one = export(Message.tdm, out, NIGHT, tmp_path / "one", Wanted([lone[0]]))
     assert len([f for f in one if f.endswith(".tdm")]) == 1
 
 
 def test_one_object_can_be_asked_for(night_dataset, tmp_path):
     name = observed(night_dataset)["object_id"].drop_nulls()[0]
-    files = export(Message.tdm, str(night_dataset), NIGHT, tmp_path / "a", [name])
+    files = export(Message.tdm, str(night_dataset), NIGHT, tmp_path / "a", Wanted([name]))
     assert [f for f in files if f.endswith("tdm")] == [f"{name}.tdm"]
 
 
 def an_object_that_is_not_there(out):
-    return {"object_ids": ["20190401-99999"]}, "no observations of 20190401-99999"
+    return {"wanted": Wanted(["20190401-99999"])}, "no observations of 20190401-99999"
 
 
 def another_night(out):
@@ -155,3 +158,88 @@ def test_bad_input_is_one_line_and_nothing_is_written(prepare, night_dataset, tm
                "out": tmp_path / "out"} | asked
         )  # fmt: skip
     assert sorted(tmp_path.rglob("*")) == before
+
+
+def written(kind, dataset, folder, wanted):
+    return [folder / name for name in export(kind, str(dataset), NIGHT, folder, wanted)]
+
+
+@pytest.mark.parametrize("frame", ["EME2000", "ITRF"])
+def test_an_ephemeris_is_what_screening_services_take(frame, night_dataset, tmp_path):
+    name = observed(night_dataset, "orbits")["object_id"][0]
+    wanted = Wanted([name], MessageFrame(frame), ahead_h=3.0)
+    (path,) = written(Message.oem, night_dataset, tmp_path / "oem", wanted)
+    text = path.read_text()
+    assert faults_of(text) == []
+    assert "errors of the forces are not in the covariance" in text
+    (segment,) = ccsds.Oem.from_str(text).segments
+    first, last = (segment.data.state_vector[k].epoch for k in (0, -1))
+    hours = (np.datetime64(last) - np.datetime64(first)) / np.timedelta64(1, "h")
+    assert 3.0 < hours < 3.1
+
+
+def test_the_checker_of_screening_finds_what_is_wrong(night_dataset, tmp_path):
+    name = observed(night_dataset, "orbits")["object_id"][0]
+    (path,) = written(Message.oem, night_dataset, tmp_path / "oem", Wanted([name]))
+    text = path.read_text()
+    assert faults_of(text) == ["frame", "frame of covariance"]  # GCRF
+    assert "a state without covariance" in faults_of(text[: text.index("COVARIANCE_START")])
+    lines = text.splitlines(keepends=True)
+    (start,) = (k for k, line in enumerate(lines) if line.startswith("META_STOP"))
+    assert "a state without covariance" in faults_of(
+        "".join(lines[: start + 2] + lines[start + 3 :])
+    )
+
+
+def test_frames_of_messages_hold_the_same_states(night_dataset, tmp_path):
+    name = observed(night_dataset, "orbits")["object_id"][0]
+    vectors = {}
+    for frame in MessageFrame:
+        folder = tmp_path / frame
+        (path,) = written(Message.opm, night_dataset, folder, Wanted([name], frame))
+        vectors[frame] = ccsds.Opm.from_file(str(path)).segment.data
+    states = {frame: data.state_vector for frame, data in vectors.items()}
+    r, v = (
+        {f: np.array([[getattr(s, a + end) for a in "xyz"]]) for f, s in states.items()}
+        for end in ("", "_dot")
+    )
+    time_ns = np.array([np.datetime64(states["GCRF"].epoch, "ns").astype(np.int64)])
+    orientation = orientation_at(time_ns, *read_earth_orientation())
+    for frame in ("EME2000", "ITRF"):
+        back_r, back_v = to_gcrf(frame, time_ns, r[frame], v[frame], orientation)
+        assert np.abs(back_r - r["GCRF"]).max() < 3e-6  # times have microseconds
+        assert np.abs(back_v - v["GCRF"]).max() < 1e-8
+    total = [
+        sum(getattr(data.covariance_matrix, f"c{a}_{a}") for a in "xyz")
+        for data in vectors.values()
+    ]
+    assert total == pytest.approx([total[0]] * 3, rel=1e-9)
+
+
+def test_a_comprehensive_message_has_the_numbers_of_the_catalogue(night_dataset, tmp_path):
+    name = observed(night_dataset, "orbits")["object_id"][0]
+
+    def named(rows):
+        is_it = pl.col("object_id") == name
+        return rows.with_columns(
+            status=pl.when(is_it).then(pl.lit("known")).otherwise("status"),
+            norad_id=pl.when(is_it).then(pl.lit(7, pl.Int64)),
+            cospar_id=pl.when(is_it).then(pl.lit("1998-067A")),
+            name=pl.when(is_it).then(pl.lit("S")),
+        )  # fmt: skip
+
+    out = changed(night_dataset, tmp_path / "ds", identifications=named)
+    wanted = Wanted([name], MessageFrame.EME2000)
+    (path,) = written(Message.ocm, out, tmp_path / "ocm", wanted)
+    message = ccsds.Ocm.from_file(str(path)).segment
+    meta, (trajectory,), (covariance,) = message.metadata, message.data.traj, message.data.cov
+    assert (meta.object_name, meta.international_designator) == ("S", "1998-067A")
+    assert (meta.catalog_name, meta.object_designator) == ("SATCAT", "7")
+    assert (trajectory.traj_ref_frame, trajectory.traj_type) == ("EME2000", "CARTPV")
+    assert len(trajectory.traj_lines) == len(covariance.cov_lines) > 6
+    (other,) = written(Message.oem, out, tmp_path / "oem", wanted)
+    (segment,) = ccsds.Oem.from_file(str(other)).segments
+    first = segment.data.state_vector[0]
+    assert list(trajectory.traj_lines[0].values) == pytest.approx(
+        [first.x, first.y, first.z, first.x_dot, first.y_dot, first.z_dot]
+    )

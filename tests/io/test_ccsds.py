@@ -50,7 +50,7 @@ def test_an_ephemeris_has_its_states_and_covariances():
     assert [v.epoch for v in vectors] == times(ephemeris().time_ns)
     assert [vectors[0].x, vectors[0].z_dot] == pytest.approx([STATE[0], STATE[5]], abs=1e-9)
     (covariance,) = segment.data.covariance_matrix
-    assert covariance.cov_ref_frame is None
+    assert covariance.cov_ref_frame == "GCRF"
     found = [covariance.cx_x, covariance.cy_x, covariance.cz_dot_z_dot]
     assert found == pytest.approx([COV[0, 0], COV[1, 0], COV[5, 5]])
 

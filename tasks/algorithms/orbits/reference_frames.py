@@ -1,4 +1,4 @@
-"""Reference frames: states from EME2000, TEME and ITRF to GCRF.
+"""Reference frames: states from EME2000, TEME and ITRF to GCRF, and from GCRF to those of messages.
 
 Rotations are IAU 2006/2000A by pyerfa. The IERS corrections dX, dY (below 0.001 arcsec, 4 cm for
 a low orbit) are neglected, as in astropy.
@@ -141,6 +141,35 @@ def to_gcrf(
     if frame == "ITRF":
         return gcrf_from_itrf(time_ns, r_km, v_km_s, orientation)
     raise ValueError(f"expected a frame of {', '.join(FRAMES)}, got {frame!r}")
+
+
+MESSAGE_FRAMES = ("GCRF", "EME2000", "ITRF")
+
+
+def from_gcrf(frame: str, time_ns: Nanoseconds, orientation: Orientation) -> Array:
+    """Return (n, 6, 6): what turns states (km, km/s) of GCRF to a frame, and their covariances.
+
+    Parameters
+    ----------
+    frame
+        One of `MESSAGE_FRAMES`. ITRF turns with the Earth: velocities are those past the ground.
+    time_ns : (n,) int
+        UTC since 1970.
+    orientation
+        Earth's orientation at the same times.
+    """
+    turn = np.zeros((len(time_ns), 6, 6))
+    if frame != "ITRF":
+        R = EME2000_FROM_GCRF if frame == "EME2000" else np.eye(3)
+        turn[:, :3, :3] = turn[:, 3:, 3:] = R
+        return turn
+    tio = erfa.sp00(*tt_julian_date(time_ns))
+    R_itrf_from_tirs = erfa.pom00(orientation.xp_rad, orientation.yp_rad, tio)
+    R_tirs_from_gcrf = _tirs_from_gcrf(time_ns, orientation)
+    rotation = EARTH_RATE_RAD_S * np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 0.0]])
+    turn[:, :3, :3] = turn[:, 3:, 3:] = R_itrf_from_tirs @ R_tirs_from_gcrf
+    turn[:, 3:, :3] = -R_itrf_from_tirs @ rotation @ R_tirs_from_gcrf
+    return turn
 
 
 def _tirs_from_gcrf(time_ns: Nanoseconds, orientation: Orientation) -> Array:

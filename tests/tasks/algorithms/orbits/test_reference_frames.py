@@ -7,6 +7,8 @@ from epipole.io.catalogues.earth_orientation import EarthOrientation, read_earth
 from epipole.tasks.algorithms.constants import EARTH_RATE_RAD_S
 from epipole.tasks.algorithms.orbits.reference_frames import (
     FRAMES,
+    MESSAGE_FRAMES,
+    from_gcrf,
     gcrf_from_eme2000,
     gcrf_from_itrf,
     orientation_at,
@@ -132,3 +134,14 @@ def test_no_states_give_no_states_and_an_unknown_frame_is_refused():
         assert to_gcrf(frame, time_ns, none, none, orientation)[0].shape == (0, 3)
     with pytest.raises(ValueError, match="J2000"):
         to_gcrf("J2000", time_ns, none, none, orientation)
+
+
+@pytest.mark.parametrize("frame", MESSAGE_FRAMES)
+def test_states_of_messages_turn_back_to_gcrf(states, frame):
+    time_ns, r_km, v_km_s = states
+    orientation = orientation_at(time_ns, *read_earth_orientation())
+    turn = from_gcrf(frame, time_ns, orientation)
+    turned = np.einsum("nij,nj->ni", turn, np.concatenate([r_km, v_km_s], axis=1))
+    r, v = to_gcrf(frame, time_ns, turned[:, :3], turned[:, 3:], orientation)
+    assert np.abs(r - r_km).max() < 1e-8
+    assert np.abs(v - v_km_s).max() < 1e-11
