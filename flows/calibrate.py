@@ -10,6 +10,7 @@ import pyarrow.compute as pc
 from epipole.flows.night.summary import many
 from epipole.io.caches.private_folders import temporary_folder
 from epipole.io.logs.listing import list_logs
+from epipole.io.logs.writer import distortion_of
 from epipole.io.work.work_layout import ReadFolder
 from epipole.schemas.bridge import concat
 from epipole.schemas.errors import LogError
@@ -80,12 +81,13 @@ def calibration_message(report: CameraReport) -> dict[str, Any]:
     """Return the fields of a foxglove.CameraCalibration with the camera that was found."""
     c = report.camera
     assert c is not None
+    model, coefficients = distortion_of(c._asdict())
     return {
         "frame_id": report.sensor_id,
         "width": c.width,
         "height": c.height,
-        "distortion_model": "plumb_bob",
-        "D": [round(v, 9) for v in (c.k1, c.k2, c.p1, c.p2, c.k3)],
+        "distortion_model": model,
+        "D": [round(v, 9) for v in coefficients],
         "K": [round(v, 3) for v in (c.fx_px, 0.0, c.cx_px, 0.0, c.fy_px, c.cy_px, 0.0, 0.0, 1.0)],
     }
 

@@ -228,7 +228,8 @@ class Reason(StrEnum):
     BAD_DISTORTION = (
         "bad_distortion",
         Stage.READ,
-        "The calibration's D has not 4 or 5 finite numbers, or one that is out of bounds.",
+        "The calibration's D has not 4 or 5 finite numbers (4 of a fisheye), or one that is out of "
+        "bounds.",
         Trait.INVALID_CALIBRATION,
     )
     FOLDED_IMAGE = (
@@ -241,7 +242,8 @@ class Reason(StrEnum):
     UNKNOWN_DISTORTION_MODEL = (
         "unknown_distortion_model",
         Stage.READ,
-        "The calibration's distortion model is not plumb_bob.",
+        "The calibration's distortion model is neither plumb_bob nor that of a fisheye "
+        "(equidistant, fisheye, kannala_brandt).",
         Trait.INVALID_CALIBRATION,
     )
     # Of a sensor's frames.

@@ -172,6 +172,12 @@ class SceneCamera(Group):
     p1: float = 0.0
     p2: float = 0.0
     k3: float = 0.0
+    k4: float = 0.0
+    fisheye: bool = Field(
+        False,
+        description="Without distortion, the distance from the principal point is the angle from "
+        "the boresight times the focal length (ROS's equidistant).",
+    )
     departure: LensDeparture = LensDeparture()
 
     @model_validator(mode="after")

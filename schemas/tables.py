@@ -419,6 +419,13 @@ CALIBRATIONS = schema(
             column(f"sigma_{name}", F64, unit=unit, doc=f"1-sigma of {name}.")
             for name, unit, _ in _OPTICS
         ],
+        column("k4", F64, doc="Of the eighth power; as the log states it."),
+        column(
+            "fisheye",
+            pa.bool_(),
+            doc="Without distortion, the distance from the principal point is the angle from the "
+            "boresight times the focal length (ROS's equidistant).",
+        ),
         column("n_stars", I32, doc="Star images used in the fit."),
         column("residual_px", F64, unit="px", doc="Rms of their image residuals."),
     ],

@@ -86,8 +86,9 @@ CAMERAS = schema(
         column("height", I64, unit="px", doc="Image height."),
         *[
             column(name, F64, doc="Pinhole and Brown-Conrady coefficients.")
-            for name in ("fx_px", "fy_px", "cx_px", "cy_px", "k1", "k2", "p1", "p2", "k3")
+            for name in ("fx_px", "fy_px", "cx_px", "cy_px", "k1", "k2", "p1", "p2", "k3", "k4")
         ],
+        column("fisheye", pa.bool_(), doc="A fisheye instead of a pinhole."),
         *covariance(
             "cov_{}",
             unit="products of the units of both numbers",

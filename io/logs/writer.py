@@ -177,12 +177,12 @@ class LogWriter:
         """Write a calibration that holds from `time_ns` on.
 
         `camera` has width, height, fx_px, fy_px, cx_px, cy_px [px] and k1, k2, p1, p2, k3, as
-        a mapping or as attributes.
+        a mapping or as attributes; a fisheye has k1, k2, k3, k4 and `fisheye`.
         """
         if not isinstance(camera, Mapping):
-            names = ("width", "height", "fx_px", "fy_px", "cx_px", "cy_px")
-            camera = {
-                name: getattr(camera, name) for name in (*names, "k1", "k2", "p1", "p2", "k3")
+            names = ("width", "height", "fx_px", "fy_px", "cx_px", "cy_px", "k1", "k2", "k3")
+            camera = {name: getattr(camera, name) for name in names} | {
+                name: getattr(camera, name, 0.0) for name in ("p1", "p2", "k4", "fisheye")
             }
         self._write(CALIBRATION, time_ns, sensor_id, calibration_values(sensor_id, time_ns, camera))
 
@@ -257,16 +257,27 @@ class LogWriter:
         return schema
 
 
+def distortion_of(camera: Values) -> tuple[str, list[float]]:
+    """Return the distortion model of a calibration message, and its coefficients D.
+
+    A fisheye's is Foxglove's `kannala_brandt`, which has no tangential terms.
+    """
+    fisheye = bool(camera.get("fisheye", False))
+    names = ("k1", "k2", "k3", "k4") if fisheye else ("k1", "k2", "p1", "p2", "k3")
+    return "kannala_brandt" if fisheye else "plumb_bob", [float(camera[n]) for n in names]
+
+
 def calibration_values(sensor_id: str, time_ns: int, camera: Values) -> dict[str, Any]:
     """Return a camera as the values of a calibration message; see `LogWriter.camera`."""
     fx, fy, cx, cy = (float(camera[n]) for n in ("fx_px", "fy_px", "cx_px", "cy_px"))
+    model, coefficients = distortion_of(camera)
     return {
         "timestamp": time_ns,
         "frame_id": sensor_id,
         "width": int(camera["width"]),
         "height": int(camera["height"]),
-        "distortion_model": "plumb_bob",
-        "D": [float(camera[n]) for n in ("k1", "k2", "p1", "p2", "k3")],
+        "distortion_model": model,
+        "D": coefficients,
         "K": [fx, 0.0, cx, 0.0, fy, cy, 0.0, 0.0, 1.0],
         "R": [1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0],
         "P": [fx, 0.0, cx, 0.0, 0.0, fy, cy, 0.0, 0.0, 0.0, 1.0, 0.0],

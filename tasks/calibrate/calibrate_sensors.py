@@ -242,6 +242,6 @@ def _row(sensor_id: str, fit: OpticsFit) -> pa.Table:
     return table(
         CALIBRATIONS,
         {"sensor_id": [sensor_id], "n_stars": [fit.n_stars], "residual_px": [fit.residual_px]}
-        | {name: [getattr(fit.camera, name)] for name in OPTICS}
+        | {name: [getattr(fit.camera, name)] for name in (*OPTICS, "k4", "fisheye")}
         | {f"sigma_{name}": [s] for name, s in zip(OPTICS, sigma.tolist(), strict=True)},
     )

@@ -100,7 +100,7 @@ def _start(exposures: pa.Table, cameras: pa.Table, field_deg: float | None) -> t
         camera = camera_of(cameras, 0)
         if field_deg is None:
             return camera, REACH
-        camera = camera._replace(k1=0.0, k2=0.0, p1=0.0, p2=0.0, k3=0.0)
+        camera = camera._replace(k1=0.0, k2=0.0, p1=0.0, p2=0.0, k3=0.0, k4=0.0, fisheye=False)
     else:
         width, height = (_side_px(exposures, name) for name in ("x_px", "y_px"))
         camera = Camera(width, height, 1.0, 1.0, (width - 1) / 2, (height - 1) / 2)

@@ -31,7 +31,8 @@ MOTION_NS = 5_000_000_000  # positions so near to the epoch show how an object m
 AROUND_NS = 60_000_000_000  # frames so near to an epoch give the attitude at it
 QUATERNION = ["qx", "qy", "qz", "qw"]
 SEEN = ["x_px", "y_px", "ra_deg", "dec_deg"]
-OPTICS = ["fx_px", "fy_px", "cx_px", "cy_px", "k1", "k2", "p1", "p2", "k3"]
+OPTICS = ["fx_px", "fy_px", "cx_px", "cy_px", "k1", "k2", "p1", "p2", "k3", "k4",
+          "fisheye"]  # fmt: skip
 
 
 class EpipolarLine(NamedTuple):

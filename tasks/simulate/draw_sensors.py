@@ -38,10 +38,11 @@ def sent_optics(camera: SceneCamera) -> TrueOptics:
     if camera.focal_px is not None:
         focal = camera.focal_px
     else:
-        focal = camera.width / 2 / math.tan(math.radians(camera.fov_deg or 0.0) / 2)
+        half_rad = math.radians(camera.fov_deg or 0.0) / 2
+        focal = camera.width / 2 / (half_rad if camera.fisheye else math.tan(half_rad))
     cx = (camera.width - 1) / 2 if camera.cx_px is None else camera.cx_px
     cy = (camera.height - 1) / 2 if camera.cy_px is None else camera.cy_px
-    lens = camera.k1, camera.k2, camera.p1, camera.p2, camera.k3
+    lens = camera.k1, camera.k2, camera.p1, camera.p2, camera.k3, camera.k4, camera.fisheye
     return TrueOptics(camera.width, camera.height, focal, focal, cx, cy, *lens)
 
 

@@ -69,6 +69,22 @@ def test_a_run_finds_a_focal_length_and_says_so(log, told_px, tmp_path, caplog):
 
 
 @pytest.mark.usefixtures("prefect")
+def test_a_fisheye_with_another_focal_length_than_logged_is_found(tmp_path):
+    # 80 degrees along the sides, 113 to the corners.
+    camera = {"fov_deg": 80.0, "width": 2048, "height": 2048, "fisheye": True, "k1": -0.02,
+              "k2": 5e-3, "k3": -1e-3, "k4": 2e-4, "departure": {"focal": 0.03}}  # fmt: skip
+    pointing = {"mode": "random", "clear_of_earth_deg": 50.0}
+    scene = scene_of({"camera": camera, "pointing": pointing, "magnitude_limit": 4.5})
+    log = simulate(scene, tmp_path / "n.mcap", seed=3).logs[0]
+    made = run(log, tmp_path / "out")
+    assert (made["frames"]["attitude_source"] == "stars").mean() > 0.9
+    assert made["frames"]["residual_px"].median() < 0.2
+    assert made["calibrations"]["fisheye"][0]
+    focal_px = 1024 / np.radians(40.0) * 1.03
+    assert made["calibrations"]["fx_px"][0] == pytest.approx(focal_px, rel=5e-4)
+
+
+@pytest.mark.usefixtures("prefect")
 @pytest.mark.parametrize(("mode", "said"), [("report", True), ("off", False)])
 def test_a_camera_is_not_used_where_the_settings_say_so(log, tmp_path, caplog, mode, said):
     with caplog.at_level(logging.WARNING):

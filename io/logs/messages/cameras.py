@@ -16,7 +16,12 @@ from epipole.schemas.log_bounds import CORNER, DISTORTION, FOCAL_LENGTH, FOCAL_R
 from epipole.schemas.rejects import Reason
 from epipole.schemas.work_tables import CAMERAS
 
-POWERS = (2, 4, 1, 1, 6)  # of the distance, by which k1 k2 p1 p2 k3 move an image position
+# Names of the distortion models: pinhole; fisheye, as ROS, OpenCV and Foxglove call it.
+PINHOLE, FISHEYE = ("", "plumb_bob"), ("equidistant", "fisheye", "kannala_brandt")
+# The coefficients D of each, and powers of the distance by which they move an image position.
+PINHOLE_TERMS = {"k1": 2, "k2": 4, "p1": 1, "p2": 1, "k3": 6}
+FISHEYE_TERMS = {"k1": 2, "k2": 4, "k3": 6, "k4": 8}
+TERMS = ("k1", "k2", "p1", "p2", "k3", "k4")
 # Limit of the search, in distances of the corner. Within its bounds the distortion moves nothing
 # that far.
 FARTHEST_UNDISTORTED = 4.0
@@ -52,9 +57,7 @@ class CameraColumns:
         """Return CAMERAS of the calibrations since the last call."""
         rows, self._rows = self._rows, []
         matrices = np.array([c.K for c in rows], float).reshape(-1, 9)
-        distortion = np.zeros((len(rows), 5))
-        for i, c in enumerate(rows):
-            distortion[i, : len(c.D)] = c.D
+        distortion = np.array([_coefficients(c) for c in rows], float).reshape(-1, len(TERMS))
         return table(
             CAMERAS,
             {
@@ -66,30 +69,43 @@ class CameraColumns:
                 "fy_px": matrices[:, 4],
                 "cx_px": matrices[:, 2],
                 "cy_px": matrices[:, 5],
-                **dict(zip(("k1", "k2", "p1", "p2", "k3"), distortion.T, strict=True)),
+                **dict(zip(TERMS, distortion.T, strict=True)),
+                "fisheye": [c.distortion_model in FISHEYE for c in rows],
                 **unstack_covariance("cov_{}", np.zeros((len(rows), 9, 9)), OPTICS_AXES),
             },
         )
+
+
+def _coefficients(calibration: CalibrationMessage) -> tuple[float, ...]:
+    """Return the numbers of `TERMS`."""
+    terms = FISHEYE_TERMS if calibration.distortion_model in FISHEYE else PINHOLE_TERMS
+    given = dict(zip(terms, calibration.D.tolist(), strict=False))
+    return tuple(given.get(name, 0.0) for name in TERMS)
 
 
 def _camera_fault(calibration: CalibrationMessage) -> Reason | None:
     sides = (calibration.width, calibration.height)
     if any(side not in IMAGE_SIDE for side in sides):
         return IMAGE_SIDE.reason
-    if calibration.distortion_model not in ("", "plumb_bob"):
+    fisheye = calibration.distortion_model in FISHEYE
+    if not fisheye and calibration.distortion_model not in PINHOLE:
         return Reason.UNKNOWN_DISTORTION_MODEL
-    if len(calibration.D) not in (0, 4, 5) or not np.isfinite(calibration.D).all():
+    if (
+        len(calibration.D) not in ((0, 4) if fisheye else (0, 4, 5))
+        or not np.isfinite(calibration.D).all()
+    ):
         return Reason.BAD_DISTORTION
     if len(calibration.K) != 9:
         return Reason.BAD_CAMERA_MATRIX
     # A recorder may repeat one calibration with each frame.
-    return _optics_fault(sides, tuple(calibration.K.tolist()), tuple(calibration.D.tolist()))
+    return _optics_fault(sides, tuple(calibration.K.tolist()), _coefficients(calibration), fisheye)
 
 
 @lru_cache(maxsize=256)
 def _optics_fault(
-    sides: tuple[int, int], K: tuple[float, ...], D: tuple[float, ...]
+    sides: tuple[int, int], K: tuple[float, ...], D: tuple[float, ...], fisheye: bool
 ) -> Reason | None:
+    """Return what is wrong with the optics; D are the numbers of `TERMS`."""
     focal = K[0], abs(K[4])
     # The first focal length is positive: an image is mirrored by one negative length at most.
     if any(f not in FOCAL_LENGTH for f in focal) or focal[0] / focal[1] not in FOCAL_RATIO:
@@ -103,24 +119,26 @@ def _optics_fault(
         for side, c, f in zip(sides, (K[2], K[5]), focal, strict=True)
     ]
     corner = math.hypot(*far)
-    if corner not in CORNER:
+    if (math.tan(min(corner, 1.5)) if fisheye else corner) not in CORNER:
         return CORNER.reason
-    if any(k * corner**power not in DISTORTION for k, power in zip(D, POWERS, strict=False)):
+    powers = PINHOLE_TERMS | FISHEYE_TERMS
+    if any(k * corner ** powers[name] not in DISTORTION for k, name in zip(D, TERMS, strict=True)):
         return DISTORTION.reason
-    return Reason.FOLDED_IMAGE if any(D) and _folds(D, corner, max(far)) else None
+    farthest = math.pi / 2 if fisheye else FARTHEST_UNDISTORTED * corner
+    return Reason.FOLDED_IMAGE if any(D) and _folds(D, corner, max(far), farthest) else None
 
 
-def _folds(D: tuple[float, ...], corner: float, side: float) -> bool:
+def _folds(D: tuple[float, ...], corner: float, side: float, farthest: float) -> bool:
     """Return whether the distortion folds the image before the end of its longer half axis.
 
     Along a ray from the boresight the distorted distance must grow until it reaches that of the
     corner, or has at least reached `side`: a wide lens shows nothing in the corners of its image.
     The derivative of the distorted position must keep its sign so far, whatever the direction.
     """
-    k1, k2, p1, p2, k3 = (*D, 0.0)[:5]
-    r = np.linspace(0.0, FARTHEST_UNDISTORTED * corner, FOLD_STEPS)
+    k1, k2, p1, p2, k3, k4 = D
+    r = np.linspace(0.0, farthest, FOLD_STEPS)
     r2 = r * r
-    distorted = r * (1 + r2 * (k1 + r2 * (k2 + r2 * k3)))
+    distorted = r * (1 + r2 * (k1 + r2 * (k2 + r2 * (k3 + r2 * k4))))
     beyond = np.flatnonzero(distorted >= corner)
     falls = np.flatnonzero(np.diff(distorted) <= 0)
     if len(beyond) and not (len(falls) and falls[0] < beyond[0]):
@@ -132,8 +150,8 @@ def _folds(D: tuple[float, ...], corner: float, side: float) -> bool:
     r2 = r2[: last + 1, None]
     angle = np.linspace(0.0, 2 * np.pi, FOLD_DIRECTIONS, endpoint=False)
     x, y = np.sqrt(r2) * np.cos(angle), np.sqrt(r2) * np.sin(angle)
-    radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
-    slope = 2 * k1 + r2 * (4 * k2 + r2 * 6 * k3)
+    radial = 1 + r2 * (k1 + r2 * (k2 + r2 * (k3 + r2 * k4)))
+    slope = 2 * k1 + r2 * (4 * k2 + r2 * (6 * k3 + r2 * 8 * k4))
     xx = radial + slope * x * x + 2 * p1 * y + 6 * p2 * x
     yy = radial + slope * y * y + 6 * p1 * y + 2 * p2 * x
     xy = slope * x * y + 2 * p1 * x + 2 * p2 * y

@@ -1,6 +1,12 @@
-"""The camera: pinhole and Brown-Conrady distortion (OpenCV's and ROS's plumb_bob).
+"""The camera: a pinhole or a fisheye, then Brown-Conrady distortion.
 
 Pixel (0, 0) is the middle of the top-left pixel; x right, y down, z out along the boresight.
+
+A direction at the angle theta from the boresight has its ideal position at the distance tan(theta)
+from the principal point with a pinhole, and theta with a fisheye, in focal lengths. Distortion
+moves this position. A pinhole with it is OpenCV's and ROS's plumb_bob. A fisheye with its radial
+terms alone is OpenCV's fisheye, ROS's equidistant and Foxglove's kannala_brandt: Kannala and Brandt
+(2006), A generic camera model and calibration method, eq. 6, with k1 = 1.
 """
 
 from functools import lru_cache
@@ -10,6 +16,10 @@ import numpy as np
 import numpy.typing as npt
 
 Array = npt.NDArray[np.float64]
+
+# Largest angle from the boresight that a fisheye shows [rad]. Directions are compared on the plane
+# at right angles to the boresight, which ends at pi / 2.
+WIDEST_RAD = 1.5
 
 
 class Camera(NamedTuple):
@@ -25,8 +35,10 @@ class Camera(NamedTuple):
         Focal lengths along columns and rows.
     cx_px, cy_px : float
         Principal point; (0, 0) is the middle of the top-left pixel.
-    k1, k2, p1, p2, k3 : float
-        Distortion, Brown-Conrady, in the order of OpenCV.
+    k1, k2, p1, p2, k3, k4 : float
+        Distortion, Brown-Conrady, in the order of OpenCV; k4 is of the eighth power.
+    fisheye : bool
+        Without distortion, the distance from the principal point is the angle from the boresight.
     """
 
     width: int
@@ -40,11 +52,13 @@ class Camera(NamedTuple):
     p1: float = 0.0
     p2: float = 0.0
     k3: float = 0.0
+    k4: float = 0.0
+    fisheye: bool = False
 
     @property
     def distorts(self) -> bool:
-        """Whether any distortion coefficient differs from 0."""
-        return any((self.k1, self.k2, self.p1, self.p2, self.k3))
+        """Whether positions differ from those of an ideal pinhole."""
+        return self.fisheye or any((self.k1, self.k2, self.p1, self.p2, self.k3, self.k4))
 
     @property
     def pixel_rad(self) -> float:
@@ -55,15 +69,23 @@ class Camera(NamedTuple):
     def field_deg(self) -> tuple[float, float]:
         """Width and height of the field of view, without distortion [deg]."""
         sides = (self.width, self.fx_px), (self.height, abs(self.fy_px))
-        across, down = (float(np.degrees(2 * np.arctan(n / 2 / f))) for n, f in sides)
+        across, down = (float(np.degrees(2 * self._angle_rad(n / 2 / f))) for n, f in sides)
         return across, down
+
+    @property
+    def corner_distance(self) -> float:
+        """Distance of the farthest corner from the principal point [focal lengths]."""
+        x = max(self.cx_px + 0.5, self.width - 0.5 - self.cx_px) / self.fx_px
+        y = max(self.cy_px + 0.5, self.height - 0.5 - self.cy_px) / abs(self.fy_px)
+        return float(np.hypot(x, y))
 
     @property
     def half_diagonal_rad(self) -> float:
         """Angle from the boresight to the farthest corner, without distortion [rad]."""
-        x = max(self.cx_px + 0.5, self.width - 0.5 - self.cx_px) / self.fx_px
-        y = max(self.cy_px + 0.5, self.height - 0.5 - self.cy_px) / abs(self.fy_px)
-        return float(np.arctan(np.hypot(x, y)))
+        return self._angle_rad(self.corner_distance)
+
+    def _angle_rad(self, distance: float) -> float:
+        return min(distance, WIDEST_RAD) if self.fisheye else float(np.arctan(distance))
 
 
 def mirrored(camera: Camera) -> Camera:
@@ -86,36 +108,101 @@ FOLD_STEPS = 4000
 
 @lru_cache(maxsize=256)
 def fold_radius(camera: Camera) -> float:
-    """Return the undistorted radius from which the radial distortion folds back; inf: it does not.
+    """Return the ideal distance from which the radial distortion folds back; inf: it does not.
 
-    Beyond it, two directions would have one pixel position. A lens shows nothing there.
+    Beyond it, two directions would have one pixel position. A lens shows nothing there. Of a
+    fisheye it is `WIDEST_RAD` at most.
     """
-    if not any((camera.k1, camera.k2, camera.k3)):
-        return float(np.inf)
-    r = np.linspace(0.0, FARTHEST, FOLD_STEPS)
+    farthest = WIDEST_RAD if camera.fisheye else FARTHEST
+    unfolded = WIDEST_RAD if camera.fisheye else float(np.inf)
+    if not any((camera.k1, camera.k2, camera.k3, camera.k4)):
+        return unfolded
+    r = np.linspace(0.0, farthest, FOLD_STEPS)
     r2 = r * r
-    slope = 1 + r2 * (3 * camera.k1 + r2 * (5 * camera.k2 + r2 * 7 * camera.k3))
+    high = 7 * camera.k3 + r2 * 9 * camera.k4
+    slope = 1 + r2 * (3 * camera.k1 + r2 * (5 * camera.k2 + r2 * high))
     folded = np.flatnonzero(slope <= 0)
-    return float(r[folded[0] - 1]) if len(folded) else float(np.inf)
+    return float(r[folded[0] - 1]) if len(folded) else unfolded
 
 
 def distort(camera: Camera, x: Array, y: Array) -> tuple[Array, Array]:
-    """Return distorted normalised coordinates (OpenCV, camera calibration, eq. plumb_bob)."""
+    """Return distorted normalised coordinates of directions (x, y, 1), each (n,)."""
     if not camera.distorts:
         return np.array(x, float), np.array(y, float)
+    return _bend(camera, *ideal_position(camera, x, y))
+
+
+def slopes(camera: Camera, x: Array, y: Array) -> tuple[Array, Array, Array, Array]:
+    """Return the derivatives of `distort`: of x by x, of x by y, of y by x, of y by y."""
+    if not camera.fisheye:
+        across, mixed, down = _bend_slopes(camera, x, y)
+        return across, mixed, mixed, down
+    axx, axy, ayy = _bend_slopes(camera, *ideal_position(camera, x, y))
+    bxx, bxy, byy = _fisheye_slopes(x, y)
+    return (
+        axx * bxx + axy * bxy,
+        axx * bxy + axy * byy,
+        axy * bxx + ayy * bxy,
+        axy * bxy + ayy * byy,
+    )
+
+
+# From the direction to the ideal position.
+
+AT_MIDDLE = 1e-4  # distances below which tangent and angle differ by less than 1e-8 of themselves
+
+
+def ideal_position(camera: Camera, x: Array, y: Array) -> tuple[Array, Array]:
+    """Return the positions of directions (x, y, 1) before distortion [focal lengths], each (n,)."""
+    if not camera.fisheye:
+        return x, y
+    share = _angle_over_tangent(np.hypot(x, y))
+    return x * share, y * share
+
+
+def _angle_over_tangent(tangent: Array) -> Array:
+    near = np.maximum(tangent, AT_MIDDLE)
+    return np.where(tangent > AT_MIDDLE, np.arctan(near) / near, 1 - tangent * tangent / 3)
+
+
+def _direction(camera: Camera, x: Array, y: Array) -> tuple[Array, Array]:
+    """Return the inverse of `ideal_position`; NaN beyond `WIDEST_RAD`."""
+    if not camera.fisheye:
+        return x, y
+    angle = np.hypot(x, y)
+    share = _angle_over_tangent(np.tan(np.where(angle <= WIDEST_RAD, angle, np.nan)))
+    return x / share, y / share
+
+
+def _fisheye_slopes(x: Array, y: Array) -> tuple[Array, Array, Array]:
+    """Return the derivatives of a fisheye's `ideal_position`: x by x, x by y (y by x), y by y."""
     r2 = x * x + y * y
-    radial = 1 + r2 * (camera.k1 + r2 * (camera.k2 + r2 * camera.k3))
+    share = _angle_over_tangent(np.sqrt(r2))
+    slope = (1 / (1 + r2) - share) / np.maximum(r2, AT_MIDDLE**2)  # d share / d r, over r
+    slope = np.where(r2 > AT_MIDDLE**2, slope, -2.0 / 3)
+    return share + slope * x * x, slope * x * y, share + slope * y * y
+
+
+# From the ideal position to the image.
+
+
+def _bend(camera: Camera, x: Array, y: Array) -> tuple[Array, Array]:
+    """Return distorted positions (OpenCV, camera calibration, eq. plumb_bob)."""
+    r2 = x * x + y * y
+    radial = 1 + r2 * (camera.k1 + r2 * (camera.k2 + r2 * (camera.k3 + r2 * camera.k4)))
     xd = x * radial + 2 * camera.p1 * x * y + camera.p2 * (r2 + 2 * x * x)
     yd = y * radial + camera.p1 * (r2 + 2 * y * y) + 2 * camera.p2 * x * y
     return xd, yd
 
 
-def slopes(camera: Camera, x: Array, y: Array) -> tuple[Array, Array, Array]:
-    """Return the derivatives of `distort`: of x by x, of x by y (and y by x), of y by y."""
-    k1, k2, p1, p2, k3 = camera.k1, camera.k2, camera.p1, camera.p2, camera.k3
+def _bend_slopes(camera: Camera, x: Array, y: Array) -> tuple[Array, Array, Array]:
+    """Return the derivatives of `_bend`: of x by x, of x by y (and y by x), of y by y."""
+    k1, k2, p1, p2, k3, k4 = (
+        camera.k1, camera.k2, camera.p1, camera.p2, camera.k3, camera.k4,
+    )  # fmt: skip
     r2 = x * x + y * y
-    radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
-    slope = 2 * (k1 + r2 * (2 * k2 + 3 * k3 * r2))  # d radial / d r2, times 2
+    radial = 1 + r2 * (k1 + r2 * (k2 + r2 * (k3 + r2 * k4)))
+    slope = 2 * (k1 + r2 * (2 * k2 + r2 * (3 * k3 + 4 * k4 * r2)))  # d radial / d r2, times 2
     return (
         radial + slope * x * x + 2 * p1 * y + 6 * p2 * x,
         slope * x * y + 2 * p1 * x + 2 * p2 * y,
@@ -129,17 +216,22 @@ def undistort(camera: Camera, xd: Array, yd: Array) -> tuple[Array, Array]:
     NaN where no direction before the fold of the distortion has this position, as in the corners of
     a wide lens's image.
     """
-    x, y = np.array(xd, float), np.array(yd, float)
     if not camera.distorts:
-        return x, y
+        return np.array(xd, float), np.array(yd, float)
+    return _direction(camera, *_straighten(camera, xd, yd))
+
+
+def _straighten(camera: Camera, xd: Array, yd: Array) -> tuple[Array, Array]:
+    """Return the inverse of `_bend`, NaN beyond the fold."""
+    x, y = np.array(xd, float), np.array(yd, float)
     fold = fold_radius(camera)
     for _ in range(8 if np.isinf(fold) else 40):
-        ex, ey = distort(camera, x, y)
+        ex, ey = _bend(camera, x, y)
         ex -= xd
         ey -= yd
         # Convergence is quadratic: after a step from below 1e-9 the rest is rounding.
         last = max(np.abs(ex).max(initial=0.0), np.abs(ey).max(initial=0.0)) < 1e-9
-        jxx, jxy, jyy = slopes(camera, x, y)
+        jxx, jxy, jyy = _bend_slopes(camera, x, y)
         determinant = jxx * jyy - jxy * jxy
         x, y = (
             x - (jyy * ex - jxy * ey) / determinant,
@@ -151,7 +243,7 @@ def undistort(camera: Camera, xd: Array, yd: Array) -> tuple[Array, Array]:
             x, y = _before(fold, x, y)
     if np.isinf(fold):
         return x, y
-    ex, ey = distort(camera, x, y)
+    ex, ey = _bend(camera, x, y)
     found = (np.hypot(ex - xd, ey - yd) < 1e-7) & (np.hypot(x, y) <= fold)
     return np.where(found, x, np.nan), np.where(found, y, np.nan)
 
@@ -193,6 +285,6 @@ def pixel_angle(camera: Camera, u: Array) -> Array:
     """
     solid = u[..., 2] * u[..., 2] * u[..., 2] / (camera.fx_px * abs(camera.fy_px))
     if camera.distorts:
-        jxx, jxy, jyy = slopes(camera, u[..., 0] / u[..., 2], u[..., 1] / u[..., 2])
-        solid /= np.maximum(np.abs(jxx * jyy - jxy * jxy), 1e-6)
+        jxx, jxy, jyx, jyy = slopes(camera, u[..., 0] / u[..., 2], u[..., 1] / u[..., 2])
+        solid /= np.maximum(np.abs(jxx * jyy - jxy * jyx), 1e-6)
     return np.sqrt(solid)

@@ -9,7 +9,13 @@ right.
 import numpy as np
 import numpy.typing as npt
 
-from epipole.tasks.algorithms.geometry.camera import Camera, project, slopes, unproject
+from epipole.tasks.algorithms.geometry.camera import (
+    Camera,
+    ideal_position,
+    project,
+    slopes,
+    unproject,
+)
 from epipole.tasks.algorithms.geometry.directions import skew, tangent_basis
 
 Array = npt.NDArray[np.float64]
@@ -128,14 +134,14 @@ def image_derivatives(camera: Camera, u: Array) -> tuple[Array, Array]:
         By the numbers of `OPTICS`.
     """
     x, y = u[:, 0] / u[:, 2], u[:, 1] / u[:, 2]
-    r2, xy2 = x * x + y * y, 2 * x * y
-    across, mixed, down = slopes(camera, x, y)
-    stretch = np.stack([across, mixed, mixed, down], axis=1).reshape(-1, 2, 2)
+    stretch = np.stack(slopes(camera, x, y), axis=1).reshape(-1, 2, 2)
     turned = np.empty((len(x), 2, 3))  # undistorted position by the rotation vector
     turned[:, 0] = np.stack([-x * y, 1 + x * x, -y], axis=1)
     turned[:, 1] = np.stack([-1 - y * y, x * y, x], axis=1)
     f = np.array([camera.fx_px, camera.fy_px])
     px, py = project(camera, u)
+    x, y = ideal_position(camera, x, y)
+    r2, xy2 = x * x + y * y, 2 * x * y
     moved = np.zeros((len(x), 2, 9))
     moved[:, 0, 0], moved[:, 1, 1] = (px - camera.cx_px) / f[0], (py - camera.cy_px) / f[1]
     moved[:, 0, 2] = moved[:, 1, 3] = 1.0

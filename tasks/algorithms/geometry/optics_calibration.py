@@ -73,7 +73,7 @@ class NominalOptics(NamedTuple):
     def sigma(self) -> Array:
         """1-sigma prior of each parameter of `OPTICS`, (9,)."""
         camera = self.camera
-        f, r = np.sqrt(camera.fx_px * abs(camera.fy_px)), np.tan(camera.half_diagonal_rad)
+        f, r = np.sqrt(camera.fx_px * abs(camera.fy_px)), camera.corner_distance
         at_corner = CORNER_PX / f / np.array([r**3, r**5, r**2, r**2, r**7])
         point_px = self.principal_point_px
         if point_px is None:
@@ -217,10 +217,12 @@ def calibrate_in_steps(
     if present not in (None, given.camera):
         start = _fit(given, given.camera, grouped, fixed.u, FIXED, sigma)
     radial = _with_steps(given, grouped, _Choice(start, FIXED), STEPS, penalty)
-    best = _with_steps(given, grouped, radial, [TANGENTIAL], penalty)
+    # The model of a fisheye has no tangential terms.
+    tangential = [] if given.camera.fisheye else [TANGENTIAL]
+    best = _with_steps(given, grouped, radial, tangential, penalty)
     if _determines_principal_point(free.cov, given.sigma):
         # Tangential terms may only imitate the principal point: it is also tried before them.
-        before = _with_steps(given, grouped, radial, [PRINCIPAL_POINT, TANGENTIAL], penalty)
+        before = _with_steps(given, grouped, radial, [PRINCIPAL_POINT, *tangential], penalty)
         after = _with_steps(given, grouped, best, [PRINCIPAL_POINT], penalty)
         best = min(before, after, key=lambda choice: _criterion(given, choice, penalty))
     rest = _values(free.camera) - _values(best.fit.camera)

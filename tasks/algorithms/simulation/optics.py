@@ -27,12 +27,17 @@ class TrueOptics(NamedTuple):
     p1: float = 0.0
     p2: float = 0.0
     k3: float = 0.0
+    k4: float = 0.0
+    fisheye: bool = False
 
 
 def bend(optics: TrueOptics, x: Array, y: Array) -> tuple[Array, Array]:
-    """Return normalised coordinates behind a Brown-Conrady lens (OpenCV's five terms)."""
+    """Return normalised coordinates behind a Brown-Conrady lens.
+
+    (x, y) are those of a pinhole; a fisheye's have the angle from the boresight for its tangent.
+    """
     r2 = x**2 + y**2
-    radial = 1 + optics.k1 * r2 + optics.k2 * r2**2 + optics.k3 * r2**3
+    radial = 1 + optics.k1 * r2 + optics.k2 * r2**2 + optics.k3 * r2**3 + optics.k4 * r2**4
     xy = 2 * x * y
     return (
         radial * x + optics.p1 * xy + optics.p2 * (r2 + 2 * x**2),
@@ -42,7 +47,12 @@ def bend(optics: TrueOptics, x: Array, y: Array) -> tuple[Array, Array]:
 
 def image_position(optics: TrueOptics, u: Array) -> tuple[Array, Array]:
     """Return columns and rows [px] of (n, 3) sensor-frame directions with z > 0."""
-    x, y = bend(optics, u[:, 0] / u[:, 2], u[:, 1] / u[:, 2])
+    x, y = u[:, 0] / u[:, 2], u[:, 1] / u[:, 2]
+    if optics.fisheye:
+        across = np.hypot(u[:, 0], u[:, 1])
+        angle = np.arctan2(across, u[:, 2])
+        x, y = (angle * part / np.where(across > 0, across, 1.0) for part in (u[:, 0], u[:, 1]))
+    x, y = bend(optics, x, y)
     return optics.fx_px * x + optics.cx_px, optics.fy_px * y + optics.cy_px
 
 
@@ -63,7 +73,8 @@ def field_radius(optics: TrueOptics) -> float:
     for _ in range(30):  # a fixed-point iteration: the distortion is small
         got_x, got_y = bend(optics, x, y)
         x, y = x + wanted_x - got_x, y + wanted_y - got_y
-    return float(np.arctan(np.max(np.hypot(x, y)))) * 1.01 + 1e-4
+    farthest = float(np.max(np.hypot(x, y)))
+    return (farthest if optics.fisheye else float(np.arctan(farthest))) * 1.01 + 1e-4
 
 
 # Lines of sight: light time, aberration, and the Earth in between.

@@ -241,7 +241,7 @@ def _n_trials(reach: float) -> int:
 
 def _distorted(camera: Camera, share: float) -> Camera:
     """Return the camera with another k1: its image's diagonal grows by this share."""
-    return camera._replace(k1=camera.k1 + share / float(np.tan(camera.half_diagonal_rad)) ** 2)
+    return camera._replace(k1=camera.k1 + share / camera.corner_distance**2)
 
 
 def _scaled(camera: Camera, ratio: float) -> Camera:

@@ -405,6 +405,8 @@ def test_a_calibration_of_rows_that_count_upward_is_valid(tmp_path):
     [
         ({"distortion_model": "rational_polynomial"}, "unknown_distortion_model"),
         ({"D": [0.1, 0.2, 0.3]}, "bad_distortion"),
+        ({"distortion_model": "equidistant", "D": [0.0] * 5}, "bad_distortion"),
+        ({"distortion_model": "fisheye", "D": [0.0, 0.0, 0.0, 2e4]}, "bad_distortion"),
         ({"K": [0.0] * 9}, "bad_camera_matrix"),
         ({"K": [1.0] * 8}, "bad_camera_matrix"),
         ({"K": [9.0, 0.5, 1.0, 0.0, 9.0, 1.0, 0.0, 0.0, 1.0]}, "bad_camera_matrix"),
@@ -426,9 +428,17 @@ def test_a_calibration_of_another_model_is_a_row(tmp_path, changes, reason):
     assert [row[0] for row in reasons(contents)] == [reason]
 
 
-def test_a_distortion_of_four_terms_has_no_k3(tmp_path):
+@pytest.mark.parametrize(
+    ("model", "terms"),
+    [
+        ("", {"k1": -0.05, "p2": -1e-4, "k3": 0.0, "k4": 0.0, "fisheye": False}),
+        ("equidistant", {"k1": -0.05, "k3": 1e-4, "k4": -1e-4, "p1": 0.0, "fisheye": True}),
+        ("kannala_brandt", {"k3": 1e-4, "p2": 0.0, "fisheye": True}),
+    ],
+)
+def test_the_meaning_of_four_terms_is_that_of_the_distortion_model(tmp_path, model, terms):
     values = json_calibration()
-    values["D"], values["distortion_model"] = values["D"][:4], ""
+    values["D"], values["distortion_model"] = values["D"][:4], model
     good = json.dumps({"timestamp": "2019-04-01T04:00:00Z", "sensor_id": "a"}).encode()
     path = write_raw(
         tmp_path / "a.mcap",
@@ -437,7 +447,7 @@ def test_a_distortion_of_four_terms_has_no_k3(tmp_path):
         encoding="json",
     )
     camera = read_log(path).cameras
-    assert [camera[n][0].as_py() for n in ("k1", "p2", "k3")] == [-0.05, -1e-4, 0.0]
+    assert {name: camera[name][0].as_py() for name in terms} == terms
 
 
 @pytest.mark.parametrize("data", [b"\xff\xff\xff", b"\x2a\x03abc", frame()[:-1]])

@@ -1,5 +1,7 @@
 """The camera, against OpenCV's printed formulas."""
 
+import math
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -12,6 +14,7 @@ from epipole.tasks.algorithms.geometry.camera import (
     inside,
     pixel_angle,
     project,
+    slopes,
     undistort,
     unproject,
 )
@@ -99,3 +102,53 @@ def test_before_the_fold_of_a_wide_lens_undistortion_is_the_inverse_and_beyond_i
 
 def test_a_camera_that_does_not_fold_has_no_fold():
     assert fold_radius(WIDE._replace(k1=0.2)) == np.inf
+
+
+# 85 degrees along the sides, 120 to the corners.
+FISHEYE = Camera(
+    1024, 1024, 690.0, 690.0, 500.0, 520.0, -0.02, 0.006, 0.0, 0.0, -0.002, 3e-4, fisheye=True
+)
+
+
+def _opencv_fisheye(camera, x, y):
+    """OpenCV 4 documentation, fisheye, "Detailed Description", one point at a time."""
+    r = math.hypot(x, y)
+    theta = math.atan(r)
+    k = camera.k1, camera.k2, camera.k3, camera.k4
+    bent = theta * (1 + sum(c * theta ** (2 * n) for n, c in enumerate(k, start=1)))
+    return x * bent / r, y * bent / r
+
+
+@settings(deadline=None)
+@given(st.floats(1e-6, 1.7), st.floats(0, 6.3))
+def test_a_fisheye_is_opencvs_and_undistortion_its_inverse(r, turn):
+    x, y = r * math.cos(turn), r * math.sin(turn)
+    got = distort(FISHEYE, np.array([x]), np.array([y]))
+    np.testing.assert_allclose(np.ravel(got), _opencv_fisheye(FISHEYE, x, y), atol=1e-12)
+    np.testing.assert_allclose(np.ravel(undistort(FISHEYE, *got)), [x, y], rtol=1e-8, atol=1e-12)
+
+
+@pytest.mark.parametrize("camera", [CAMERA, FISHEYE, FISHEYE._replace(p1=2e-3, p2=-1e-3)])
+def test_slopes_are_the_derivatives_of_the_distortion(camera):
+    x, y = np.array([0.0, 3e-5, 0.3, -0.5]), np.array([0.0, 4e-5, -0.2, 0.4])
+    step = 1e-6
+    by_x = (np.stack(distort(camera, x + step, y)) - distort(camera, x - step, y)) / (2 * step)
+    by_y = (np.stack(distort(camera, x, y + step)) - distort(camera, x, y - step)) / (2 * step)
+    want = [by_x[0], by_y[0], by_x[1], by_y[1]]
+    np.testing.assert_allclose(slopes(camera, x, y), want, atol=1e-8)
+
+
+@pytest.mark.parametrize("xy", [(500.0, 520.0), (3.0, 8.0), (1000.0, 400.0)])
+def test_a_pixel_of_a_fisheye_spans_the_root_of_its_solid_angle(xy):
+    x, y = xy
+    u = unproject(FISHEYE, np.array([x, x + 0.01, x]), np.array([y, y, y + 0.01]))
+    solid = np.linalg.norm(np.cross(u[1] - u[0], u[2] - u[0])) / 1e-4
+    assert pixel_angle(FISHEYE, u[:1])[0] == pytest.approx(np.sqrt(solid), rel=1e-3)
+
+
+def test_the_field_of_a_fisheye_is_its_image_over_the_focal_length():
+    plain = Camera(100, 50, 100.0, 100.0, 49.5, 24.5, fisheye=True)
+    assert plain.field_deg == pytest.approx((np.degrees(1.0), np.degrees(0.5)))
+    assert plain.half_diagonal_rad == pytest.approx(np.hypot(0.5, 0.25))
+    # No direction in front of the camera is that far from the boresight.
+    assert np.isnan(unproject(plain, np.array([300.0]), np.array([24.5]))).all()

@@ -38,8 +38,11 @@ CAMERA = Camera(1024, 1024, 2900.0, 2910.0, 515.0, 508.0, -0.2, 0.05, 3e-4, -2e-
 SMALL = dict(zip(OPTICS, (0.01, 0.01, 0.01, 0.01, 1e-5, 1e-4, 1e-6, 1e-6, 1e-3), strict=True))
 
 
-def changed(name):
-    return CAMERA._replace(**{name: getattr(CAMERA, name) + SMALL[name]})
+FISHEYE = CAMERA._replace(fx_px=600.0, fy_px=610.0, fisheye=True)
+
+
+def changed(name, camera=CAMERA):
+    return camera._replace(**{name: getattr(camera, name) + SMALL[name]})
 
 
 def places(n, seed=0):
@@ -50,16 +53,17 @@ def directions(camera, n, seed=0):
     return unproject(camera, *places(n, seed))
 
 
-def test_derivatives_are_those_of_small_changes():
-    u = directions(CAMERA, 50)
-    J_turn, J_optics = image_derivatives(CAMERA, u)
-    here = np.stack(project(CAMERA, u), axis=1)
+@pytest.mark.parametrize("camera", [CAMERA, FISHEYE])
+def test_derivatives_are_those_of_small_changes(camera):
+    u = directions(camera, 50)
+    J_turn, J_optics = image_derivatives(camera, u)
+    here = np.stack(project(camera, u), axis=1)
     for k, name in enumerate(OPTICS):
-        there = np.stack(project(changed(name), u), axis=1)
+        there = np.stack(project(changed(name, camera), u), axis=1)
         np.testing.assert_allclose(J_optics[:, :, k] * SMALL[name], there - here, atol=1e-6)
     for k in range(3):
         turned = Rotation.from_rotvec(1e-6 * np.eye(3)[k]).apply(u)
-        there = np.stack(project(CAMERA, turned), axis=1)
+        there = np.stack(project(camera, turned), axis=1)
         np.testing.assert_allclose(J_turn[:, :, k] * 1e-6, there - here, atol=1e-7)
 
 
