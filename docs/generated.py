@@ -10,6 +10,7 @@ import ast
 import contextlib
 import inspect
 import io
+import json
 import re
 import runpy
 import sys
@@ -23,6 +24,7 @@ import pyarrow as pa
 from pydantic.fields import FieldInfo
 
 from epipole.flows import api
+from epipole.schemas.contract import breaks, contract
 from epipole.schemas.log_bounds import BOUNDS, TIME
 from epipole.schemas.log_checks import CheckVerdict, LogCause, LogCheck
 from epipole.schemas.rejects import (
@@ -346,8 +348,23 @@ def with_part(text: str, name: str, content: str) -> str:
     return text.replace(f"{start}{part(text, name)}{end}", f"{start}{content}{end}")
 
 
+CONTRACT = ROOT / "docs" / "tables.json"
+
+
+def write_contract() -> None:
+    """Write docs/tables.json again, unless that would break its readers."""
+    after = contract()
+    before = json.loads(CONTRACT.read_text()) if CONTRACT.exists() else {}
+    for name, table in before.items():
+        gone = ["the table is gone"] if name not in after else breaks(table, after[name])
+        if told := list(gone):
+            sys.exit(f"{name}: {'; '.join(told)}; raise its version, or change nothing of that")
+    CONTRACT.write_text(json.dumps(after, indent=1) + "\n")
+
+
 def write(folder: Path) -> None:
     """Write all parts of all pages again."""
+    write_contract()
     for page, parts in PARTS.items():
         text = (ROOT / page).read_text()
         for name, content in parts.items():

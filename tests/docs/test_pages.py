@@ -3,6 +3,7 @@
 import re
 from pathlib import Path
 
+import polars as pl
 import pytest
 from generated import MADE_BY, PARTS, ROOT, code, orbit, output, part
 
@@ -86,7 +87,6 @@ def test_the_light_curve_of_the_page_about_orbits_is_of_one_geostationary_object
 
 
 def test_sql_finds_the_same_arcs_and_keeps_nanoseconds(example):
-    pytest.importorskip("duckdb", minversion="2.0", reason="duckdb keeps nanoseconds from 2.0 on")
     by_polars, by_sql = {}, {}
     exec(code("docs/orbits.md", "read", f"{example}/out/"), by_polars)
     exec(code("docs/orbits.md", "duckdb", f"{example}/out/"), by_sql)
@@ -100,6 +100,21 @@ def test_the_questions_have_answers(night_dataset):
     names: dict = {}
     exec(code("docs/tables.md", "questions", f"{night_dataset}/"), names)
     assert all(len(names[name]) for name in ("one_object", "came_near", "ten_minutes"))
+
+
+def test_tables_join_by_their_keys_in_polars_and_in_sql(night_dataset):
+    names: dict = {}
+    exec(code("docs/tables.md", "join", f"{night_dataset}/"), names)
+    seen = names["seen"]
+    objects = pl.read_parquet(night_dataset / "night=*/objects/*.parquet")
+    assert set(seen["object_id"]) == set(objects["object_id"])
+    assert seen["rows"].sum() == objects["n_observations"].sum()
+    assert (seen["direction_arcsec"] > seen["attitude_arcsec"]).all()
+    text = code("docs/tables.md", "sql", f"{night_dataset}/")
+    exec(text.replace("'out/", f"'{night_dataset}/"), names)
+    rows = names["seen_by_sql"].fetchall()
+    chosen = seen.select("object_id", "sensor_id", "verdict", "rows")
+    assert [row[:4] for row in rows] == chosen.rows()
 
 
 @PAGE
