@@ -53,7 +53,9 @@ class Picture {
     svg.addEventListener("pointerdown", event => this.press(event));
     for (const end of ["pointerup", "pointercancel"])
       svg.addEventListener(end, event => this.release(event));
-    svg.addEventListener("pointerleave", () => { if (!this.pressed.size) this.choose(-1); });
+    svg.addEventListener("pointerleave", event => {
+      if (event.pointerType === "mouse" && !this.pressed.size) this.choose(-1);
+    });
     svg.addEventListener("blur", () => this.choose(-1));
     svg.addEventListener("keydown", event => this.key(event));
     svg.addEventListener("wheel", event => this.wheel(event), { passive: false });
@@ -145,6 +147,8 @@ class Picture {
 
   choose(k) {
     if (!this.dots) return;
+    if (k >= 0 && Picture.active && Picture.active !== this) Picture.active.choose(-1);
+    Picture.active = k >= 0 ? this : null;
     this.chosen = k;
     const dot = this.dots[k];
     this.ring.setAttribute("visibility", dot ? "visible" : "hidden");
@@ -292,6 +296,12 @@ class Picture {
   }
 }
 Picture.count = 0;
+Picture.active = null; // the one with a text
+addEventListener("scroll", () => { if (Picture.active) Picture.active.choose(Picture.active.chosen); },
+  { passive: true });
+addEventListener("pointerdown", event => {
+  if (Picture.active && !event.target.closest("figure")) Picture.active.choose(-1);
+});
 
 for (const svg of document.querySelectorAll("svg.plot[tabindex]")) new Picture(svg);
 document.documentElement.classList.add("live");

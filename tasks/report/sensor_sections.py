@@ -37,6 +37,7 @@ from epipole.tasks.report.solved_chi2 import Chi2
 from epipole.tasks.report.stars import StarMap, StarResiduals
 
 PICTURE_IN = 2.6  # usual height
+FEW_PICTURES = 2  # fill half the width
 SERIES_IN = 2.8
 MAX_IMAGES = 8  # sensors whose image is drawn
 MAX_TABLE_ROWS = 60
@@ -114,12 +115,11 @@ def sigmas(facts: NightFacts) -> Section:
         return Section("sigmas", title, nothing("The night has no residuals to judge."))
     rows = list(_sigma_rows(facts))
     heading = ("what", "values", "mean square", "verdict")
-    body = (
-        paragraph("Each residual is divided by its sigma. The mean of the squares should be 1: "
-                  "above it the sigmas are too small, below it too large.")
-        + figures(pictures)
-        + table("Mean squares of normalised residuals", heading, rows)
-    )  # fmt: skip
+    body = paragraph("Each residual is divided by its sigma. The mean of the squares should be 1: "
+                     "above it the sigmas are too small, below it too large.")  # fmt: skip
+    squares = table("Mean squares of normalised residuals", heading, rows)
+    few = len(pictures) <= FEW_PICTURES
+    body += beside(figures(pictures), squares) if few else figures(pictures) + squares
     return Section("sigmas", title, body)
 
 

@@ -117,6 +117,20 @@ def test_tables_join_by_their_keys_in_polars_and_in_sql(night_dataset):
     assert [row[:4] for row in rows] == chosen.rows()
 
 
+def test_nights_of_an_older_version_are_read_with_the_others(night_dataset, tmp_path):
+    rows = pl.read_parquet(night_dataset / "night=*/objects/*.parquet", hive_partitioning=False)
+    for night, gone in (("2019-03-31", ["name", "verdict"]), ("2019-04-01", [])):
+        folder = tmp_path / "out" / f"night={night}" / "objects"
+        folder.mkdir(parents=True)
+        rows.drop(gone).write_parquet(folder / "part-0.parquet")
+    names: dict = {}
+    exec(code("docs/tables.md", "older", f"{tmp_path / 'out'}/"), names)
+    found = names["objects"]
+    assert len(found) == 2 * len(rows)
+    assert found["verdict"].null_count() == len(rows)
+    assert found["night"].n_unique() == 2
+
+
 @PAGE
 def test_links_lead_to_files_and_headings(page):
     for target in links(page):
