@@ -1,6 +1,7 @@
 """Dots over time as SVG, written directly: an object has two pictures, and matplotlib is slow.
 
-A picture has the parts and classes that those of `canvas` have, so page.js treats both alike.
+A picture has the parts and classes that those of `canvas` have, so page.js treats both alike. What
+its texts and lines look like stands in page.html.
 """
 
 from collections.abc import Sequence
@@ -20,7 +21,6 @@ LEFT, RIGHT, TOP, BOTTOM = 34.0, 6.0, 6.0, 40.0  # margins
 MARKS = 4  # kinds of dots, which page.html defines: they differ for those who see no colours
 STEPS = 4  # of the y axis, about
 LEGEND_PT = 56.0  # a name in the legend
-FONT = "font-size: 7.5px"
 
 
 class Dots(NamedTuple):
@@ -65,7 +65,7 @@ def draw_dots(
     return (
         f'<svg viewBox="0 0 {WIDTH:g} {HEIGHT:g}" xmlns="http://www.w3.org/2000/svg" '
         f'data-box="{box[0]:g} {box[1]:g} {box[2]:g} {box[3]:g}" {sides} data-kind="time">'
-        f"{''.join(parts)}</svg>"
+        f'<g class="dots">{"".join(parts)}</g></svg>'
     )
 
 
@@ -94,33 +94,28 @@ def _axes(scale: _Scale, ylabel: str) -> str:
     floor = top + height
     ticks, labels = clock_ticks(*scale.across)
     columns = [scale.column(tick) for tick in ticks]
-    first = "".join(_tick(x, floor, x, floor + 3, x, floor + 11, text, "middle")
+    first = "".join(_tick(x, floor, "v3", x, floor + 11, text)
                     for x, text in zip(columns, labels, strict=True))  # fmt: skip
     values = _round_values(*sorted(scale.along))
-    second = "".join(_tick(left, y, left - 3, y, left - 5, y + 2.6, f"{value:g}", "end")
+    second = "".join(_tick(left, y, "h-3", left - 5, y + 2.6, f"{value:g}")
                      for value in values for y in (scale.row(value),))  # fmt: skip
     middle = top + height / 2
     return (
         f'<path d="M{left} {top}V{floor}H{left + width}" '
         f'style="fill: none; stroke: var(--grey); stroke-width: 0.6"/>'
-        f'<g class="xaxis">{first}{_text(left + width / 2, floor + 21, "time, UTC", "middle")}</g>'
+        f'<g class="xaxis">{first}{_text(left + width / 2, floor + 21, "time, UTC")}</g>'
         f'<g class="yaxis">{second}<text x="8" y="{middle:g}" transform="rotate(-90 8 {middle:g})" '
-        f'style="{FONT}; text-anchor: middle; fill: var(--ink)">{escape(ylabel)}</text></g>'
+        f">{escape(ylabel)}</text></g>"
     )
 
 
-def _tick(
-    x: float, y: float, to_x: float, to_y: float, at_x: float, at_y: float, text: str, how: str
-) -> str:
-    line = f"M{x:.1f} {y:.1f}L{to_x:.1f} {to_y:.1f}"
-    return f'<g class="tick"><path d="{line}" style="stroke: var(--grey); stroke-width: 0.6"/>' + (
-        _text(at_x, at_y, text, how) + "</g>"
-    )
+def _tick(x: float, y: float, line: str, at_x: float, at_y: float, text: str) -> str:
+    mark = f'<path d="M{x:.1f} {y:.1f}{line}"/>'
+    return f'<g class="tick">{mark}{_text(at_x, at_y, text)}</g>'
 
 
-def _text(x: float, y: float, text: str, how: str) -> str:
-    style = f"{FONT}; text-anchor: {how}; fill: var(--ink)"
-    return f'<text x="{x:.1f}" y="{y:.1f}" style="{style}">{escape(text)}</text>'
+def _text(x: float, y: float, text: str) -> str:
+    return f'<text x="{x:.1f}" y="{y:.1f}">{escape(text)}</text>'
 
 
 def _round_values(low: float, high: float) -> list[float]:
@@ -155,6 +150,5 @@ def _legend(name: str, k: int) -> str:
         return ""
     x, y = LEFT + k * LEGEND_PT, HEIGHT - 6
     colour = f"var(--{COLOURS[LINES[k % len(LINES)][0]]})"
-    return f'<use href="#mark{k % MARKS}" x="{x:g}" y="{y:g}" style="fill: {colour}"/>' + _text(
-        x + 6, y + 2.6, short(name, 10), "start"
-    )
+    mark = f'<use href="#mark{k % MARKS}" x="{x:g}" y="{y:g}" style="fill: {colour}"/>'
+    return f'<g class="named">{mark}{_text(x + 6, y + 2.6, short(name, 10))}</g>'

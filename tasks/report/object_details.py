@@ -35,6 +35,10 @@ class ObjectDetail(NamedTuple):
     step: int
     by_sensor: pl.DataFrame
 
+    def thinned(self, every: int) -> "ObjectDetail":
+        """Return it with every n-th of its observations."""
+        return self._replace(seen=self.seen.gather_every(every), step=self.step * every)
+
 
 def read_object_details(night: NightReader, object_ids: Sequence[str]) -> list[ObjectDetail]:
     """Return the details of these objects, in their order."""

@@ -271,8 +271,7 @@ class Picture {
     this.own.replaceChildren();
     if (this.scale === 1) return;
     const [left, top, width, height] = this.box;
-    const style = this.svg.querySelector(".tick text").getAttribute("style")
-      .replace(/text-anchor:[^;]*;?/, "");
+    const style = "font-size: " + getComputedStyle(this.svg.querySelector(".tick text")).fontSize;
     for (const [axis, from, length] of [["x", left, width], ["y", top, height]]) {
       const number = axis === "x" ? 0 : 1;
       const [first, last] = numbers(this.svg.dataset[axis]);

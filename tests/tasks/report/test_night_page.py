@@ -14,6 +14,7 @@ from epipole.io.datasets.dataset import night_reader
 from epipole.tasks.report.night_facts import read_night_facts
 
 pytest.importorskip("matplotlib")
+from epipole.tasks.report import page as page_module
 from epipole.tasks.report.draw_sensors import _label_positions
 from epipole.tasks.report.page import night_page, report_extract
 
@@ -204,3 +205,11 @@ def test_the_extract_is_small_enough_for_an_artifact(night_dataset):
     assert len(extract.pictures) == 4
     assert all(picture.png.startswith(b"\x89PNG") for picture in extract.pictures)
     assert sum(len(picture.png) for picture in extract.pictures) * 4 / 3 < 200_000
+
+
+def test_a_page_that_would_be_too_large_has_fewer_dots(page, night_dataset, monkeypatch):
+    monkeypatch.setattr(page_module, "LARGEST_PAGE", len(page.encode()) - 1000)
+    smaller = page_of(night_reader(night_dataset, NIGHT))
+    assert len(smaller.encode()) < len(page.encode()) - 1000
+    assert "One of 4 observations is drawn." in smaller
+    assert "One of 4 observations is drawn." not in page
