@@ -21,6 +21,7 @@ from epipole.flows.night.recorded_nights import (
     write_night_row,
 )
 from epipole.flows.night.reports import with_reports
+from epipole.flows.night.run_records import Stopwatch, read_records, with_looks, write_record
 from epipole.flows.night.stages import (
     Destination,
     check,
@@ -38,7 +39,7 @@ from epipole.flows.night.stages import (
 )
 from epipole.flows.night.summary import Summary, by_reason, many, summarise
 from epipole.flows.night.work import Work, plan_spans
-from epipole.flows.prefect.artifacts import shown_on_page
+from epipole.flows.prefect.artifacts import shown_on_page, tell
 from epipole.flows.prefect.runners import runner_asked
 from epipole.flows.prefect.waiting_runs import waiting_nights
 from epipole.io.catalogues.element_sets import KnownObjects, read_known_objects
@@ -50,7 +51,7 @@ from epipole.io.datasets.dataset import (
     night_location,
 )
 from epipole.io.datasets.rows_by_night import nights_of
-from epipole.io.paths import known_as
+from epipole.io.paths import known_as, line_of
 from epipole.io.settings_file import merged_settings
 from epipole.io.work.folder import work_folder, work_root
 from epipole.io.work.recipe import Recipe, recipe_of
@@ -59,12 +60,15 @@ from epipole.schemas.bridge import concat
 from epipole.schemas.dates import LAST_NIGHTS, YESTERDAY, nights_before
 from epipole.schemas.errors import EpipoleError, LogError, NoFramesError
 from epipole.schemas.rejects import Reason
+from epipole.schemas.run_record import RunState
 from epipole.schemas.settings import Settings
 from epipole.schemas.tables import REJECTS
 from epipole.tasks.publish.write_tables import into_nights, source_table
 from epipole.tasks.read.order_frames import OrderedFrames
 
 LOGGER = logging.getLogger(__name__)
+
+COUNTED = ("sensors", "frames", "identified", "objects", "positions")  # as metrics
 
 
 @flow(
@@ -116,9 +120,13 @@ def nightly(
     before = waiting_nights()
     if night == YESTERDAY and asked is not None:
         before |= set(nights_before(asked, last_nights - 1))
-    earlier = [made_before(order, date) for date in sorted(before) if asked and date < asked]
-    summary = make_nights(order, asked)
-    return dataclasses.replace(summary, earlier=tuple(filter(None, earlier)))
+    dates = sorted(date for date in before if asked and date < asked)
+    earlier = tuple(filter(None, (made_before(order, date) for date in dates)))
+    try:
+        summary = recorded(order, asked)
+    except NoFramesError as error:
+        raise NoFramesError("; ".join([str(error), *earlier])) from error
+    return dataclasses.replace(summary, earlier=earlier)
 
 
 class Order(NamedTuple):
@@ -139,13 +147,43 @@ def made_before(order: Order, night: str) -> str | None:
     What is wrong with it does not stop the night that is asked for.
     """
     try:
-        summary = make_nights(order._replace(again=False), night)
+        summary = recorded(order._replace(again=False), night, asked=False)
     except NoFramesError:
         return None
     except EpipoleError as error:
         LOGGER.warning("night %s: %s", night, error)
         return f"{night} failed: {error}"
     return None if summary.unchanged else f"{night} made: {summary.sentence()}"
+
+
+def recorded(order: Order, night: str | None, asked: bool = True) -> Summary:
+    """Make nights as `make_nights` does; record how that ended, and tell what needs a look, once.
+
+    Where the run that has `asked` for the night fails, its state tells.
+    """
+    used = Stopwatch.start()
+    try:
+        summary = make_nights(order, night)
+    except Exception as error:
+        is_empty = isinstance(error, NoFramesError)
+        if night is not None and (asked or not is_empty):
+            state = RunState.NO_FRAMES if is_empty else RunState.FAILED
+            line = line_of(error)
+            is_new = write_record(order.out, night, state, line, used, order.settings)
+            if is_new and (is_empty or not asked):
+                tell(order.out, night, f"{state.value}: {line}")
+        raise
+    records = read_records(order.out) if summary.unchanged else {}
+    for date in summary.nights:
+        if date in records and records[date]["state"] == RunState.MADE:
+            continue
+        looks = summary.looks.get(date, [])
+        counts = {name: getattr(summary, name) for name in COUNTED}
+        is_new = write_record(order.out, date, RunState.MADE, summary.sentence(), used,
+                              order.settings, looks, counts)  # fmt: skip
+        if looks and is_new:
+            tell(order.out, date, f"needs a look: {'; '.join(looks)}")
+    return with_looks(summary) if summary.unchanged else summary
 
 
 def make_nights(order: Order, night: str | None) -> Summary:
@@ -183,8 +221,7 @@ def make_nights(order: Order, night: str | None) -> Summary:
                             folder_of_night, settings)  # fmt: skip
                 staged[date] = folder_of_night
             summary = publish(Destination(out, staged, replace), sources)
-            if settings.report.write:
-                summary = with_reports(summary, staged, staging)
+            summary = with_reports(summary, staged, settings.report.write)
     LOGGER.info("published %s", ", ".join(f"{out.rstrip('/')}/night={date}" for date in chosen))
     return summary
 
@@ -252,7 +289,8 @@ def choose_nights(
 ) -> list[str]:
     """Return the nights to publish: all that the logs have frames of, or the one asked for."""
     if not nights:
-        raise LogError(f"{', '.join(logs)}: no frames in these logs; {_advice(rejects)}")
+        kind, when = (LogError, "") if night is None else (NoFramesError, f" on {night}")
+        raise kind(f"{', '.join(logs)}: no frames{when} in these logs; {_advice(rejects)}")
     if night is None:
         return list(nights)
     if night not in nights:

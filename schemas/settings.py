@@ -475,6 +475,16 @@ class Settings(Group):
             raise ValueError(contradiction)
         return self
 
+    def changed(self) -> list[str]:
+        """Return the settings that are not the defaults, such as ``sensors.max_gaps = 0.1``."""
+        mine, usual = self.model_dump(), Settings().model_dump()
+        return [
+            f"{group}.{name} = {value!r}"
+            for group, values in mine.items()
+            for name, value in values.items()
+            if value != usual[group][name]
+        ]
+
     def key(self) -> str:
         """Return a digest of the settings that results depend on."""
         text = self.model_dump_json(exclude={"report"})

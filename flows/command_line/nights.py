@@ -1,7 +1,7 @@
 """`epipole nights`: what is in a dataset."""
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
 import typer
 
@@ -12,6 +12,7 @@ if TYPE_CHECKING:  # imported when the command runs
 
 HEADINGS = ("night", "frames", "stars", "objects", "positions", "left out", "")
 WIDTHS = (10, 11, 10, 9, 11, 10)
+INDENT = " " * 12
 
 
 def nights(
@@ -30,15 +31,21 @@ def nights(
     clear: Annotated[
         bool, typer.Option("--clear", help="Remove the unfinished work of stopped runs.")
     ] = False,
+    runs: Annotated[
+        bool, typer.Option("--runs", help="Also show what the last run of each night took.")
+    ] = False,
     as_json: AsJson = False,
 ) -> None:
-    """Show the nights of a dataset: what each contains, and which are stale.
+    """Show the nights of a dataset: what each contains, what needs a look, which are stale.
+
+    Dates between them that have no night are listed too: no frames, failed, or not run.
 
     A night is stale if a run would make it otherwise today: other code, settings or
     catalogues, or another night before it, whose objects it follows. `epipole run
     LOG... --stale` makes these again, and those whose logs have changed.
     """
     from epipole.flows.night.recorded_nights import published_nights
+    from epipole.flows.night.run_records import all_dates, read_records
     from epipole.io.catalogues.element_sets import read_known_objects
     from epipole.io.datasets.dataset import require_dataset
     from epipole.io.settings_file import read_settings
@@ -48,7 +55,14 @@ def nights(
     require_dataset(dataset)
     today = read_settings(settings) if settings else Settings()
     known_key = read_known_objects(known).sha256 if known else None
-    found = [n for n in published_nights(dataset, today, known_key) if n.stale or not stale]
+    published = {n.date: n for n in published_nights(dataset, today, known_key)}
+    records = read_records(dataset)
+    dates = list(published) if stale else all_dates([*published, *records])
+    found = [
+        _Listed(date, published.get(date), records.get(date, {}))
+        for date in dates
+        if not stale or published[date].stale
+    ]
     unfinished = clear_unfinished(dataset) if clear else unfinished_work(dataset)
     if as_json:
         print_json(
@@ -59,7 +73,7 @@ def nights(
         )
         return
     print_lines(_line(HEADINGS) for _ in found[:1])
-    print_lines(_night_line(night) for night in found)
+    print_lines(line for night in found for line in night.lines(runs))
     if not found:
         print_lines(["no night is stale" if stale else "no nights"])
     what = "removed" if clear else "unfinished; the next run continues it, --clear removes it"
@@ -68,15 +82,59 @@ def nights(
     )
 
 
-def _night_line(night: "PublishedNight") -> str:
-    row, state = night.row, f"stale: {', '.join(night.stale)}" if night.stale else ""
-    if not row:
-        return f"{night.date}  {state}"
-    share = f"{100 * row['identified'] / row['frames']:.1f} %" if row["frames"] else ""
-    counts = [f"{row[name]:,}" for name in ("objects", "positions", "left_out")]
-    if row["faults"]:
-        state = "; ".join([*row["faults"], *filter(None, [state])])
-    return _line((night.date, f"{row['frames']:,}", share, *counts, state))
+class _Listed(NamedTuple):
+    """A date: its published night, if there is one, and the record of its last run, or none."""
+
+    date: str
+    night: "PublishedNight | None"
+    record: dict[str, Any]
+
+    @property
+    def state(self) -> str:
+        """How its last run ended; no night and no record: nobody has asked for it."""
+        return self.record.get("state") or ("made" if self.night else "not run")
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return the date as JSON takes it."""
+        night = {"stale": []} if self.night is None else self.night.as_dict()
+        ended = self.record.get("ended")
+        record = self.record | ({} if ended is None else {"ended": f"{ended:%Y-%m-%dT%H:%M:%SZ}"})
+        return {**night, **record, "night": self.date, "state": self.state}
+
+    def lines(self, runs: bool) -> list[str]:
+        """Return the date as people read it: a line, one for each further thing, and the run."""
+        state = [] if self.state == "made" else [self.state]
+        state += (
+            [f"stale: {', '.join(self.night.stale)}"] if self.night and self.night.stale else []
+        )
+        sentences = self.record.get("needs_look", [])
+        if self.state == "failed":
+            sentences = [self.record["message"]]
+        elif self.night is not None and not self.record:
+            sentences = self.night.row.get("faults", [])
+        lines = [_line((self.date, *self._counts(), "; ".join(state)))]
+        lines += [f"{INDENT}{each}" for each in sentences]
+        return [*lines, *(self._run() if runs and self.record else [])]
+
+    def _counts(self) -> list[str]:
+        row = {} if self.night is None else self.night.row
+        if not row:
+            return [""] * (len(WIDTHS) - 1)
+        share = f"{100 * row['identified'] / row['frames']:.1f} %" if row["frames"] else ""
+        counts = [f"{row[name]:,}" for name in ("objects", "positions", "left_out")]
+        return [f"{row['frames']:,}", share, *counts]
+
+    def _run(self) -> list[str]:
+        record = self.record
+        sensors = [] if self.night is None else self.night.row.get("sensor_ids", [])
+        return [
+            f"{INDENT}run {record['run_id'] or 'without Prefect'} on {record['host']}, ended "
+            f"{record['ended']:%Y-%m-%d %H:%M:%S}: {record['duration_s']:.0f} s, "
+            f"{record['cpu_s']:.0f} s of CPU, {record['memory_mib']:,.0f} MiB",
+            f"{INDENT}{record['versions']}",
+            *([f"{INDENT}sensors {', '.join(sensors)}"] if sensors else []),
+            *([f"{INDENT}settings {', '.join(record['settings'])}"] if record["settings"] else []),
+        ]
 
 
 def _line(cells: tuple[str, ...]) -> str:

@@ -12,6 +12,7 @@ from epipole.flows.command_line.terminal import shown
 from epipole.flows.night.log_choice import find_logs
 from epipole.flows.night.progress import compile_step, prepare
 from epipole.flows.night.recorded_nights import published_night, unchanged_nights
+from epipole.flows.night.run_records import Stopwatch, with_looks, write_record
 from epipole.flows.night.summary import Summary, summarise
 from epipole.flows.prefect.server_process import Launched, launch
 from epipole.io.caches.kernel_compiler import (
@@ -28,6 +29,7 @@ from epipole.io.logs.listing import list_logs
 from epipole.io.settings_file import read_settings
 from epipole.schemas.errors import EpipoleError, NoFramesError
 from epipole.schemas.options import Runner
+from epipole.schemas.run_record import RunState
 from epipole.schemas.settings import Settings
 
 LOGGER = logging.getLogger(__name__)
@@ -145,10 +147,16 @@ class Nights:
         """Return the summary of what need not be made again. This needs no Prefect."""
         if self._options.again:
             return None
-        given = find_logs(self._logs, night, self._logged)
+        used = Stopwatch.start()
+        try:
+            given = find_logs(self._logs, night, self._logged)
+        except NoFramesError as error:
+            if night is not None:
+                write_record(self._out, night, RunState.NO_FRAMES, str(error), used, self._settings)
+            raise
         same = unchanged_nights(self._out, given, night, self._settings, self._known_key)
         locations = {date: night_location(self._out, date) for date in same}
-        return summarise(self._out, locations, unchanged=True) if same else None
+        return with_looks(summarise(self._out, locations, unchanged=True)) if same else None
 
     def _start(self, started: contextlib.ExitStack) -> Callable[[str | None], Summary]:
         """Start Prefect, and return what makes a night."""

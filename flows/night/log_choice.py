@@ -78,7 +78,7 @@ def find_logs(
     chosen: list[str] = []
     known_ns: dict[str, tuple[int, int]] = {}
     spans: list[tuple[int, int]] = []
-    broken: list[str] = []
+    broken: list[tuple[str, Reason, int | None]] = []
     logged = {} if logged is None else logged
     for path, is_named in _listed(named).items():
         try:
@@ -87,8 +87,14 @@ def find_logs(
             if is_named or error.__cause__ is not None:  # it may be a log that cannot be read
                 raise
             LOGGER.warning("left out: %s", error)
-            broken.append(path)
+            broken.append((path, Reason.NO_MCAP, None))
             continue
+        if path not in logged and logged_ns is None and not is_named:
+            size = size_if_empty(path)
+            if size is not None:
+                LOGGER.warning("left out: %s: %s", path, Reason.NOTHING_READ.sentence)
+                broken.append((path, Reason.NOTHING_READ, size))
+                continue
         logged[path] = logged_ns
         if not is_named and logged_ns is not None:
             known_ns[path] = logged_ns
@@ -98,7 +104,7 @@ def find_logs(
             spans.append(logged_ns)
     if not chosen:
         kind = NoFramesError if spans else LogError
-        raise kind(f"{', '.join(named)}: {_none_chosen(night, spans, broken)}")
+        raise kind(f"{', '.join(named)}: {_none_chosen(night, spans, len(broken))}")
     return FoundLogs(chosen, _rejects(broken), known_ns)
 
 
@@ -123,18 +129,31 @@ def _touches(logged_ns: tuple[int, int], night: str) -> bool:
     return first_ns < start_ns + DAY_NS + MARGIN_NS and last_ns >= start_ns - MARGIN_NS
 
 
-def _none_chosen(night: str | None, spans: Sequence[tuple[int, int]], broken: Sequence[str]) -> str:
+def size_if_empty(path: str) -> int | None:
+    """Return the size of a log in which nothing can be used; None where something can."""
+    from epipole.io.logs.reader import read_log_pieces  # not above: it is seldom needed
+
+    size = None
+    for piece in read_log_pieces(path):
+        if piece.exposures.num_rows or piece.states.num_rows or piece.cameras.num_rows:
+            return None
+        size = piece.source.size if piece.source else None
+    return size
+
+
+def _none_chosen(night: str | None, spans: Sequence[tuple[int, int]], broken: int) -> str:
     if not spans:
-        return f"none of {len(broken)} files is an MCAP log"
+        return f"none of {broken} files is an MCAP log of which anything can be used"
     first, last = (_date(f([span[i] for span in spans])) for i, f in ((0, min), (1, max)))
     have = first if first == last else f"{first} to {last}"
     return f"no frames on {night} in these logs; they have {have}"
 
 
-def _rejects(broken: Sequence[str]) -> pa.Table:
+def _rejects(broken: Sequence[tuple[str, Reason, int | None]]) -> pa.Table:
     return reject_rows(
-        Reason.NO_MCAP,
-        source=[name_of(path) for path in broken],
+        [reason for _, reason, _ in broken],
+        source=[name_of(path) for path, *_ in broken],
+        offset=[size for *_, size in broken],
         time=[0] * len(broken),
         count=[1] * len(broken),
     )

@@ -6,19 +6,26 @@ import logging
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
+from epipole.flows.night.run_records import new_broken_logs
 from epipole.flows.night.summary import Summary
-from epipole.io.datasets.dataset import night_reader, nights_in, write_report
+from epipole.io.datasets.dataset import night_reader, nights_in, write_beside
+from epipole.io.datasets.local import REPORTS
 from epipole.io.datasets.night_tables import NightReader
 from epipole.io.paths import line_of
 from epipole.schemas.errors import ReportError
-from epipole.tasks.report.night_facts import NightFacts, ReportExtract, read_night_facts
+from epipole.tasks.report.night_facts import (
+    NightFacts,
+    ReportExtract,
+    needs_look,
+    read_night_facts,
+)
 from epipole.tasks.report.objects import MAX_NIGHTS
 
 LOGGER = logging.getLogger(__name__)
 
 
-def with_reports(summary: Summary, staged: Mapping[str, Path], staging: Path) -> Summary:
-    """Write the reports of published nights; return the summary with their extracts.
+def with_reports(summary: Summary, staged: Mapping[str, Path], write: bool) -> Summary:
+    """Write the reports of published nights; return the summary with what needs a look.
 
     The nights are published: whatever happens here, the run has succeeded. So an error is a line.
 
@@ -27,22 +34,27 @@ def with_reports(summary: Summary, staged: Mapping[str, Path], staging: Path) ->
     staged
         The folders in which the nights were made. Where they still exist, the dataset lies in an
         object store, and nothing has to be fetched from it.
-    staging
-        The folder of this run.
+    write
+        Whether reports are written; the summary then has their extracts.
     """
-    extracts = []
+    extracts: list[ReportExtract] = []
+    looks: dict[str, list[str]] = {}
     try:
         nights = nights_in(summary.dataset)
         for night in summary.nights:
             folder = staged[night] if staged[night].is_dir() else None
-            text, extract = _page_and_extract(night_facts(summary.dataset, night, nights, folder))
-            write_report(summary.dataset, night, text, staging)
-            extracts.append(extract)
+            facts = night_facts(summary.dataset, night, nights, folder)
+            broken = new_broken_logs(summary.dataset, night)
+            looks[night] = [*broken, *(look.sentence for look in needs_look(facts))]
+            if write:
+                text, extract = _page_and_extract(facts)
+                write_beside(summary.dataset, REPORTS, f"{night}.html", text.encode())
+                extracts.append(extract)
     except ReportError as error:
         LOGGER.info("no report is written: %s", error)
     except Exception as error:  # of drawing, of the store, of anything: the night is done
         LOGGER.warning("the report could not be made: %s", line_of(error))
-    return dataclasses.replace(summary, extracts=tuple(extracts))
+    return dataclasses.replace(summary, extracts=tuple(extracts), looks=looks)
 
 
 def load_drawing() -> None:

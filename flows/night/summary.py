@@ -1,7 +1,7 @@
 """The summary of a run: counts of what it found, and of what it left out by reason."""
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -14,6 +14,8 @@ from epipole.schemas.log_checks import MISTAKE_COLUMNS, mistakes
 from epipole.schemas.rejects import NameStatus, ObjectVerdict, Outcome, Reason
 from epipole.schemas.stages import Declared
 from epipole.tasks.report.night_facts import ReportExtract
+
+LISTED = 4  # sentences in a run's state; the others are on its page
 
 
 @dataclass(frozen=True)
@@ -79,6 +81,7 @@ class Summary:
     unchanged: bool
     by_sensor: list[SensorSummary]
     extracts: tuple[ReportExtract, ...]  # of the nights' reports, for Prefect's page
+    looks: Mapping[str, Sequence[str]] = field(default_factory=dict)  # by night: needs a look
     earlier: tuple[str, ...] = ()  # what became of nights before these that were made too
 
     def as_dict(self) -> dict[str, Any]:
@@ -103,26 +106,31 @@ class Summary:
             *self._names(),
             *[f"mistake     {mistake}" for mistake in self.mistakes],
             *[f"fault       {fault}" for fault in self.faults],
+            *[f"look        {each}" for each in self.needs_look() if each not in self.mistakes],
             *self._left_out(),
             f"dataset     {self.dataset}",
         ]
 
     def sentence(self) -> str:
         """Return what was found as one line, with what needs a look."""
+        looks = self.needs_look()
+        more = [f"and {len(looks) - LISTED} more"] if len(looks) > LISTED else []
+        sentences = [f"needs a look: {'; '.join([*looks[:LISTED], *more])}"] if looks else []
+        sentences += self.earlier
         if self.unchanged:
-            return "; ".join([f"unchanged: {', '.join(self.nights)}", *self.earlier])
+            return "; ".join([f"unchanged: {', '.join(self.nights)}", *sentences])
         parts = [
             many(self.objects, "object"),
             many(self.positions, "position"),
             f"{self.identified:,} of {many(self.frames, 'frame')} identified",
         ]
-        if self.mistakes:
-            parts.append(f"{many(len(self.mistakes), 'mistake')} in the logs")
-        if self.faults:
-            parts.append(f"{many(len(self.faults), 'sensor')} at fault")
         if self.rejects:
             parts.append(f"{sum(self.rejects.values()):,} left out")
-        return "; ".join([", ".join(parts), *self.earlier])
+        return "; ".join([", ".join(parts), *sentences])
+
+    def needs_look(self) -> list[str]:
+        """Return what needs a look, a sentence each."""
+        return _by_night(self.looks)
 
     def doubtful(self) -> dict[str, int]:
         """Return how many objects are not sound, by verdict."""
@@ -227,6 +235,7 @@ def summarise(dataset: str, nights: Mapping[str, Where], unchanged: bool = False
             for name in sorted(pc.unique(frames["sensor_id"]).to_pylist())
         ],
         extracts=(),
+        looks={},
         earlier=(),
     )
 

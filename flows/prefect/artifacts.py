@@ -23,13 +23,16 @@ from prefect.artifacts import (
 )
 from prefect.client.schemas.objects import State
 from prefect.context import FlowRunContext, TaskRunContext
+from prefect.events import emit_event
 from prefect.exceptions import PrefectException
 from prefect.logging.handlers import APILogHandler
-from prefect.states import Completed
+from prefect.runtime import deployment
+from prefect.states import Completed, Failed
 
 from epipole.flows.night.progress import COMPILE, ROOT, STEPS, with_safe_text
 from epipole.flows.night.summary import Summary, many
-from epipole.schemas.errors import EpipoleError
+from epipole.io.datasets.local import REPORTS
+from epipole.schemas.errors import EpipoleError, NoFramesError
 from epipole.schemas.rejects import Reason
 from epipole.schemas.text import as_line, as_markdown_text
 from epipole.tasks.report.night_facts import ReportExtract
@@ -38,6 +41,7 @@ from epipole.tasks.report.night_facts import ReportExtract
 
 LOGGER = logging.getLogger(__name__)
 
+NEEDS_LOOK = "epipole.night.needs-look"  # an event
 LONGEST_ID = 100
 MAX_SENSORS = 50  # that the table of gaps names
 UPDATED_EVERY_S = 3.0
@@ -122,9 +126,12 @@ def as_markdown(summary: Summary) -> str:
     lines = [f"# Night {', '.join(summary.nights)}", "", *_table("what", counts), ""]
     if summary.unchanged:
         lines += ["Nothing has changed since it was made, so it was not made again.", ""]
+    if summary.extracts:
+        lines += [f"Report: {as_markdown_text(path)}" for path in report_paths(summary)] + [""]
     # No link: browsers open neither files nor buckets from a page.
     lines += ["Tables:", "", *(f"- {as_markdown_text(path)}" for path in _table_paths(summary))]
     for heading, sentences in (
+        ("Needs a look:", summary.needs_look()),
         ("Nights before:", summary.earlier),
         ("Mistakes in the logs:", summary.mistakes),
         ("Sensors at fault:", summary.faults),
@@ -168,6 +175,16 @@ def _table_paths(summary: Summary) -> list[str]:
     return [f"{summary.dataset.rstrip('/')}/night={night}" for night in summary.nights]
 
 
+def report_paths(summary: Summary) -> list[str]:
+    """Return where the reports of the nights lie, which have extracts."""
+    return [report_path(summary.dataset, extract.night) for extract in summary.extracts]
+
+
+def report_path(dataset: str, night: str) -> str:
+    """Return where the report of a night lies, if there is one."""
+    return f"{dataset.rstrip('/')}/{REPORTS}/{night}.html"
+
+
 def _table(heading: str, counts: dict[str, int]) -> list[str]:
     rows = [f"| {key} | {count:,} |" for key, count in counts.items()]
     return [f"| {heading} | count |", "|---|---:|", *rows]
@@ -187,9 +204,17 @@ def shown_on_page(flow: Callable[P, Summary]) -> Callable[P, State[Summary]]:
     @functools.wraps(flow)
     def shown(*args: P.args, **kwargs: P.kwargs) -> State[Summary]:
         bar = ProgressBar()
-        with _added(ROOT, _RunLog(logging.INFO)), _added(STEPS, bar):
+        with _added(ROOT, _RunLog(logging.INFO)), _added(STEPS, bar), _errors_in_one_line():
             try:
                 summary = flow(*args, **kwargs)
+            except NoFramesError as error:  # nothing is wrong with the run
+                _ended(error)
+                bar.finish("no frames")
+                return Completed(message=f"no frames: {error}", data=error)
+            except EpipoleError as error:  # raised, it would be a traceback in the run's log
+                _ended(error)
+                bar.finish("failed; see the log")
+                return Failed(message=str(error), data=error)
             except BaseException as error:
                 _ended(error)
                 bar.finish("failed; see the log")
@@ -198,9 +223,27 @@ def shown_on_page(flow: Callable[P, Summary]) -> Callable[P, State[Summary]]:
             bar.finish("done")
             show_summary(summary)
             # The page, and --watch, show the message.
-            return Completed(message=summary.sentence(), data=summary)
+            message = "; report: ".join([summary.sentence(), *report_paths(summary)[-1:]])
+            return Completed(message=message, data=summary)
 
     return shown
+
+
+def tell(dataset: str, night: str, message: str) -> None:
+    """Emit the event that automations act on: a night needs a look. Only in a deployment."""
+    if deployment.id is None:
+        return
+    with _as_warning("what needs a look"):
+        emit_event(
+            event=NEEDS_LOOK,
+            resource={
+                "prefect.resource.id": f"epipole.night.{night}",
+                "prefect.resource.name": f"night {night}",
+                "epipole.dataset": dataset,
+                "epipole.message": message,
+                "epipole.report": report_path(dataset, night),
+            },
+        )
 
 
 def _ended(how: Summary | BaseException) -> None:
@@ -233,6 +276,25 @@ def run_here(flow: Flow[P, Any], *args: P.args, **kwargs: P.kwargs) -> Summary:
     if isinstance(ended[-1], BaseException):
         raise ended[-1]
     return ended[-1]
+
+
+@contextlib.contextmanager
+def _errors_in_one_line() -> Iterator[None]:
+    """Leave the tracebacks of errors that a user can put right out of Prefect's lines."""
+
+    def shorten(record: logging.LogRecord) -> bool:
+        if record.exc_info and isinstance(record.exc_info[1], EpipoleError):
+            record.exc_info = None
+        return True
+
+    loggers = [logging.getLogger(name) for name in ("prefect.flow_runs", "prefect.task_runs")]
+    for logger in loggers:
+        logger.addFilter(shorten)
+    try:
+        yield
+    finally:
+        for logger in loggers:
+            logger.removeFilter(shorten)
 
 
 class _RunLog(APILogHandler):

@@ -15,7 +15,7 @@ from typing import Any
 
 import pyarrow as pa
 
-from epipole.io.datasets.local import REPORTS
+from epipole.io.datasets.local import REPORTS, RUNS
 from epipole.io.datasets.lock_record import STAGING
 from epipole.io.datasets.night_tables import NightReader
 from epipole.io.datasets.storage import NightStorage, Where, night_storage, reading
@@ -40,7 +40,7 @@ def check_folder(dataset: Where) -> None:
     storage = night_storage(dataset)
     with reading(dataset, storage.errors):
         names = storage.names()
-    if names and not any(n in (STAGING, REPORTS) or n.startswith("night=") for n in names):
+    if names and not any(n in (STAGING, REPORTS, RUNS) or n.startswith("night=") for n in names):
         raise DatasetError(
             f"{dataset}: holds other files and no dataset (no night=... folder); "
             "give an empty folder or a dataset"
@@ -223,13 +223,8 @@ def night_reader(dataset: Where, night: str) -> NightReader:
     return NightReader(str(storage.location(night)), night, files)
 
 
-def write_report(dataset: Where, night: str, text: str, staging: Path) -> None:
-    """Write the report of a night into the dataset, or replace an earlier one.
-
-    Parameters
-    ----------
-    staging
-        The folder of this run; see `lock_nights`.
+def write_beside(dataset: Where, folder: str, name: str, data: bytes) -> None:
+    """Write a file into a folder beside the nights of a dataset that exists, or replace it.
 
     Raises
     ------
@@ -238,7 +233,23 @@ def write_report(dataset: Where, night: str, text: str, staging: Path) -> None:
     """
     storage = night_storage(dataset)
     with _writing(dataset, storage):
-        storage.write_report(night, text, staging)
+        if storage.exists():
+            storage.write_beside(folder, name, data)
+
+
+def read_beside(dataset: Where, folder: str, schema: pa.Schema) -> list[dict[str, Any]]:
+    """Return the rows of the Parquet files in a folder beside the nights.
+
+    Files that do not have this schema are left out.
+    """
+    storage = night_storage(dataset)
+    rows = []
+    with reading(dataset, storage.errors):
+        files = storage.files_beside(folder)
+    for file in files:
+        with contextlib.suppress(OSError, ValueError, pa.ArrowException):
+            rows += [row for piece in read_pieces(file, schema) for row in piece.to_pylist()]
+    return rows
 
 
 @contextlib.contextmanager

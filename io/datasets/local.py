@@ -27,6 +27,7 @@ import os
 import re
 import shutil
 import stat
+import tempfile
 import threading
 import uuid
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -123,7 +124,8 @@ LOGGER = logging.getLogger(__name__)
 
 LOCK = "claim"  # the file in the folder of a run; earlier versions give it this name too
 COMMIT = "commit.json"
-REPORTS = "reports"  # beside the nights, never in them: readers scan night=*
+# Beside the nights, never in them: readers scan night=*.
+REPORTS, RUNS = "reports", "runs"
 
 # A folder in the folder of a run, as a commit names it from `swap-*`.
 _STAGED = re.compile(r"\.\./(run-[\w-]+)/([\w=-]+)", re.ASCII)
@@ -180,13 +182,19 @@ class LocalNights:
     def _night(self, night: str) -> Path:
         return self.folder / f"night={night}"
 
-    def write_report(self, night: str, text: str, staging: Path) -> None:
-        """Write a report by one rename from the folder of a run."""
-        staged, folder = staging / f"{night}.html", self.folder / REPORTS
-        staged.write_text(text, encoding="utf-8")
-        refuse_link(folder)
-        folder.mkdir(exist_ok=True)
-        staged.replace(folder / staged.name)
+    def write_beside(self, folder: str, name: str, data: bytes) -> None:
+        """Write a file by one rename from beside it."""
+        target = self.folder / folder
+        refuse_link(target)
+        target.mkdir(exist_ok=True)
+        with tempfile.NamedTemporaryFile(dir=target, prefix=".", delete=False) as file:
+            file.write(data)
+        os.chmod(file.name, 0o666 & ~_umask())
+        Path(file.name).replace(target / name)
+
+    def files_beside(self, folder: str) -> list[Path]:
+        """Return the Parquet files in a folder beside the nights, in order."""
+        return sorted((self.folder / folder).absolute().glob("[!.]*.parquet"))
 
     @contextlib.contextmanager
     def lock_nights(self, nights: Sequence[str]) -> Iterator[Path]:
@@ -226,6 +234,13 @@ class LocalNights:
             _clear(self.folder, staging)
             check()
             _put_all_in_place(self.folder, staged)
+
+
+def _umask() -> int:
+    """Return the umask of this process: files that are made in secret get its mode too."""
+    mask = os.umask(0o077)
+    os.umask(mask)
+    return mask
 
 
 def _read_lock(run: Path) -> LockRecord:

@@ -28,7 +28,6 @@ from typing import Any
 import pyarrow as pa
 
 from epipole.io.caches.private_folders import temporary_folder
-from epipole.io.datasets.local import REPORTS
 from epipole.io.datasets.lock_record import STAGING, LockRecord
 from epipole.io.paths import file_system, line_of, storage_errors
 from epipole.schemas.dates import is_night
@@ -268,9 +267,14 @@ class StoreNights:
         """Return the URL of a night."""
         return f"{self._dataset}/night={night}"
 
-    def write_report(self, night: str, text: str, staging: Path) -> None:
-        """Write a report as one object; the staging folder is not needed."""
-        self._storage.pipe_file(f"{self._root}/{REPORTS}/{night}.html", text.encode())
+    def write_beside(self, folder: str, name: str, data: bytes) -> None:
+        """Write one object."""
+        self._storage.pipe_file(f"{self._root}/{folder}/{name}", data)
+
+    def files_beside(self, folder: str) -> list[pa.BufferReader]:
+        """Return the Parquet files in a folder beside the nights, in order."""
+        paths = sorted(self._storage.glob(f"{self._root}/{folder}/*.parquet"))
+        return [pa.BufferReader(bytes(self._storage.cat_file(path))) for path in paths]
 
     @contextlib.contextmanager
     def lock_nights(self, nights: Sequence[str]) -> Iterator[Path]:

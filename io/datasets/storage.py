@@ -45,8 +45,11 @@ class NightStorage(Protocol):
     def location(self, night: str) -> Where:
         """Return the folder of a night, or its URL."""
 
-    def write_report(self, night: str, text: str, staging: Path) -> None:
-        """Write the report of a night, or replace it; `staging` is the folder of this run."""
+    def write_beside(self, folder: str, name: str, data: bytes) -> None:
+        """Write a file into a folder beside the nights, or replace it, at once."""
+
+    def files_beside(self, folder: str) -> Sequence[Any]:
+        """Return the Parquet files in a folder beside the nights, as pyarrow reads them."""
 
     def lock_nights(self, nights: Sequence[str]) -> contextlib.AbstractContextManager[Path]:
         """Lock nights for this run, and yield an empty folder for it; see `dataset.lock_nights`."""

@@ -11,7 +11,7 @@ from epipole.schemas.options import catalogue_of_runs
 from epipole.schemas.settings import Settings
 
 # Another version may change the last bits of a result.
-_LIBRARIES = ("numba", "numpy", "polars", "pyarrow", "pyerfa", "scipy")
+LIBRARIES = ("numba", "numpy", "polars", "pyarrow", "pyerfa", "scipy")
 
 
 class Recipe(NamedTuple):
@@ -61,7 +61,7 @@ def star_catalogue_key(which: str) -> str:
 def code_key() -> str:
     """Return a digest of this program's files and of the versions of its libraries."""
     digest = hashlib.sha256()
-    for name in _LIBRARIES:
+    for name in LIBRARIES:
         digest.update(f"{name} {metadata.version(name)}\0".encode())
     for name in ("schemas", "io", "tasks", "flows"):
         folder = Path(__file__).resolve().parents[2] / name

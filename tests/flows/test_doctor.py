@@ -63,7 +63,7 @@ def test_a_run_writes_the_same_checks_and_shows_mistakes(prefect, wrong_log, tmp
     assert rows == sorted(alone["checks"], key=lambda row: [row[name] for name in key])
     assert summary.mistakes == alone["mistakes"]
     assert f"mistake     {summary.mistakes[0]}" in summary.lines()
-    assert "1 mistake in the logs" in summary.sentence()
+    assert f"needs a look: {summary.mistakes[0]}" in summary.sentence()
     assert summary.mistakes[0] in caplog.messages
     facts = read_night_facts(night_reader(str(tmp_path / "out"), NIGHT), "out")
     assert needs_look(facts)[0].sentence == summary.mistakes[0]

@@ -62,7 +62,9 @@ def published(dataset: Path) -> dict[str, bytes]:
 
 
 def contents(dataset: Path) -> dict[str, bytes]:
-    """Return all files of a dataset but its reports, which name the folder they lie in."""
+    """Return all files of a dataset but reports, which name its folder, and records of runs."""
     files = [path for path in dataset.rglob("*") if path.is_file()]
     named = {str(path.relative_to(dataset)): path.read_bytes() for path in files}
-    return {name: data for name, data in named.items() if not name.startswith("reports/")}
+    return {
+        name: data for name, data in named.items() if not name.startswith(("reports/", "runs/"))
+    }

@@ -46,7 +46,7 @@ def test_prefect_understands_the_automations(written):
     made = [AutomationCore.model_validate(automation) for automation in held]
     assert [
         getattr(automation.actions[0], "state", automation.actions[0].type) for automation in made
-    ] == ["CRASHED", "CRASHED", "SCHEDULED", "FAILED", "do-nothing", "do-nothing"]
+    ] == ["CRASHED", "CRASHED", "SCHEDULED", "FAILED", *["do-nothing"] * 3]
     deployed = yaml.safe_load((written / "prefect.yaml").read_text())["deployments"][0]
     beats_s = int(
         deployed["work_pool"]["job_variables"]["env"]["PREFECT_FLOWS_HEARTBEAT_FREQUENCY"]
@@ -77,7 +77,7 @@ def test_a_crashed_run_is_made_again_or_has_failed_and_is_told_once(written, run
     assert acts("prefect.flow-run.Crashed") == (["SCHEDULED"] if run_count < 4 else ["FAILED"])
     assert acts("prefect.flow-run.Failed") == ["do-nothing"]
     assert acts("prefect.flow-run.AwaitingRetry") == []
-    for automation in made[-2:]:  # those that tell somebody: once of a run
+    for automation in made[-3:]:  # those that tell somebody: once of a run
         assert automation.trigger.for_each == {"prefect.resource.id"}
         assert automation.trigger.within.total_seconds() >= 3600
 

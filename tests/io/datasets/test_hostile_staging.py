@@ -13,7 +13,7 @@ from scenes.published import publish
 from typer.testing import CliRunner
 
 from epipole.flows.command_line.main import app
-from epipole.io.datasets.dataset import lock_nights, write_report
+from epipole.io.datasets.dataset import lock_nights, write_beside
 from epipole.io.datasets.object_store import store_nights
 from epipole.io.datasets.plain_files import MAX_BYTES
 from epipole.io.work.folder import work_folder
@@ -165,7 +165,7 @@ def test_a_work_folder_or_reports_that_are_links_are_not_written_to(dataset):
         pytest.fail("a link")
     (dataset / "reports").symlink_to(dataset.parent / "secret")
     with pytest.raises(DatasetError, match="is a symbolic link; remove it"):
-        write_report(dataset, NIGHT, "text", dataset / ".staging" / "run-0")
+        write_beside(dataset, "reports", f"{NIGHT}.html", b"text")
     assert [path.name for path in (dataset.parent / "secret").iterdir()] == ["key"]
 
 
