@@ -21,11 +21,8 @@ MIDNIGHT_NS = int(np.datetime64(NIGHT, "ns").astype(np.int64))
 
 
 def cameras(*sensors: str) -> pa.Table:
-    rows = [
-        {field.name: 0 if field.name != "sensor_id" else name for field in CAMERAS}
-        for name in sensors
-    ]
-    return pa.Table.from_pylist(rows, schema=CAMERAS)
+    blank = {f.name: False if pa.types.is_boolean(f.type) else 0 for f in CAMERAS}
+    return pa.Table.from_pylist([blank | {"sensor_id": name} for name in sensors], schema=CAMERAS)
 
 
 def frames(calibrated: list[str], **hours: list[float]) -> OrderedFrames:
