@@ -107,6 +107,7 @@ _HOVER, _ZOOM = "hover:", "zoom:"  # how the names of groups begin
 _CLASSES = {"matplotlib.axis_1": "xaxis", "matplotlib.axis_2": "yaxis"}
 _TICK = ("xtick_", "ytick_")
 _DATA = ("PathCollection_", "LineCollection_", "line2d_", "Quiver_", "text_", "data", _HOVER)
+_MARKS = ("PathCollection_", _HOVER)  # which keep their size
 # Colours of a picture follow those of the page, dark or light.
 COLOURS = {
     INK: "ink", GREY: "grey", PALE: "pale", "#e3e7ea": "grid", "#ffffff": "paper",
@@ -171,8 +172,8 @@ def _name_group(group: ElementTree.Element, name: str) -> None:
         group.set("class", "tick")
     elif name.startswith(_ZOOM):
         for child in group:
-            if child.get("id", "").startswith(_DATA):
-                child.set("class", "data")
+            if (kind := child.get("id", "")).startswith(_DATA):
+                child.set("class", "data marks" if kind.startswith(_MARKS) else "data")
         group.set("class", "zoom")
     elif name.startswith(_HOVER):
         texts, links = json.loads(name.removeprefix(_HOVER))

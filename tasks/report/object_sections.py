@@ -63,7 +63,7 @@ def epipolar(facts: NightFacts) -> Section:
         f"{farthest:.2f} px away. Where all is well it is as far as the pair distances above say.",
     )
     rows = [
-        (str(number), line.object_id, f"{line.distance_px:.2f}")
+        (str(number), _link(line.object_id, facts.anchors), f"{line.distance_px:.2f}")
         for number, line in enumerate(views.lines, start=1)
     ]
     distances = table("Distance of rings from lines", ("number", "object", "px"), rows)

@@ -88,12 +88,13 @@ class Picture {
     if (!this.svg.dataset.box) return;
     this.box = numbers(this.svg.dataset.box);
     const data = [...this.svg.querySelectorAll(".data")];
-    const marks = this.dots.map((dot, k) => [dot, this.places[k]]);
+    const marks = [...this.svg.querySelectorAll(".marks path, .data use, .data [data-t]")]
+      .filter(mark => !mark.closest("defs")).map(mark => [mark, this.middle(mark)]);
     const texts = data.filter(group => group.querySelector("text")).map(group => {
       const at = this.middle(group); // its dot, which it stays beside
+      const apart = place => Math.hypot(place[0] - at[0], place[1] - at[1]);
       return [group, this.places.reduce((best, place) =>
-        Math.hypot(place[0] - at[0], place[1] - at[1]) <
-        Math.hypot(best[0] - at[0], best[1] - at[1]) ? place : best, at)];
+        apart(place) < apart(best) ? place : best, this.places[0] || at)];
     });
     this.fixed = [...marks, ...texts];
     const name = "box" + Picture.count++;
@@ -107,7 +108,7 @@ class Picture {
       each.removeAttribute("clip-path");
     this.moved.append(...data);
     this.lines = [...this.moved.querySelectorAll("path:not([data-t])")]
-      .filter(path => !path.closest("defs")).map(path => [path, getComputedStyle(path)])
+      .filter(path => !path.closest("defs, .marks")).map(path => [path, getComputedStyle(path)])
       .map(([path, style]) => [path, parseFloat(style.strokeWidth),
         (style.strokeDasharray.match(/[\d.]+/g) || []).map(Number)]);
     this.own = make("g", { class: "own" }, this.svg);

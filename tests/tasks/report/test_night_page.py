@@ -146,6 +146,7 @@ def test_axes_say_their_values_for_zoom(page):
     assert left < 0 < 400 < right < 540
     groups = [each.get("class") for each in frame.iter()]
     assert "data" in groups
+    assert groups.count("data marks") >= 3
     assert "xaxis" in groups
     assert "tick" in groups
 
