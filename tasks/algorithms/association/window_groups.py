@@ -69,31 +69,52 @@ class WindowGroups:
         self.group[rows] = FREE
         self.ambiguous[rows] = self.undecided[rows] = False
 
-    def continue_groups(self, allowed: Flags) -> None:
+    def continue_groups(self, allowed: Flags, briefly_s: float) -> None:
         """Let tracklets stay together for the rest of their time.
 
-        Tracklets of a certain group may go on into a neighbouring window for a few seconds only, in
-        which they are undecided: too short a time to show again what is known already. A group in
-        that window of any of its tracklets is not changed. Only the `allowed` items, (n,) bool.
+        Tracklets of a group may go on into a neighbouring window for a few seconds only: too short
+        a time to show again what is known already. There the group goes on if it is certain and
+        they are undecided, or if all of them but one are seen for `briefly_s` at most. Where one of
+        them is in a group of that window, the others join it, unless their sensor is in it already.
+        Only the `allowed` items, (n,) bool.
         """
         items = self.items
         step = items.tracklet.max(initial=0) + 1
         key = items.window * step + items.tracklet
-        surely = np.append(self._score >= CERTAIN_LOG_ODDS, False)
-        sources = np.flatnonzero(surely[self.group])
+        brief = items.last_ns - items.first_ns <= briefly_s * 1e9
+        sources = np.flatnonzero(self.group != FREE)
         for to_next in (step, -step):
             row = np.minimum(np.searchsorted(key, key[sources] + to_next), len(key) - 1)
             there = key[row] == key[sources] + to_next
             source, row = self.group[sources[there]], row[there]
-            free = self.undecided[row] & (self.group[row] == FREE) & allowed[row]
-            others, count = np.unique(source, return_counts=True)
-            n_free = np.bincount(source[free], minlength=others.max(initial=-1) + 1)[others]
-            for g in others[(n_free == count) & (count > 1)].tolist():
-                members = row[source == g]
-                if len(np.unique(items.sensor[members])) == len(members):
-                    self.group[members] = len(self._score)
-                    self.undecided[members] = False
-                    self._score = np.append(self._score, self._score[g])
+            pair = source * (items.window.max(initial=0) + 1) + items.window[row]
+            order = np.argsort(pair, kind="stable")
+            _, starts = np.unique(pair[order], return_index=True)
+            for members in np.split(order, starts[1:]) if len(row) else []:
+                if ((self.group[row[members]] == FREE) & allowed[row[members]]).any():
+                    self._continue(int(source[members[0]]), row[members], allowed, brief)
+
+    def _continue(self, group: int, members: Indices, allowed: Flags, brief: Flags) -> None:
+        """Let a group go on with its members in another window."""
+        joined = np.unique(self.group[members][self.group[members] != FREE])
+        free = members[(self.group[members] == FREE) & allowed[members]]
+        if not len(joined):
+            sure = self._score[group] >= CERTAIN_LOG_ODDS and self.undecided[free].all()
+            alone = len(np.unique(self.items.sensor[free])) < 2
+            if alone or len(free) < len(members) or not (sure or (~brief[free]).sum() <= 1):
+                return
+            joined = np.array([len(self._score)])
+            self._score = np.append(self._score, self._score[group])
+        elif len(joined) == 1:
+            first, last = np.searchsorted(
+                self.items.window, self.items.window[members[0]] + np.arange(2)
+            )
+            there = self.items.sensor[first:last][self.group[first:last] == joined[0]]
+            free = free[brief[free] & ~np.isin(self.items.sensor[free], there)]
+        else:
+            return
+        self.group[free] = joined[0]
+        self.undecided[free] = self.ambiguous[free] = False
 
     def to_decide_again(self, rows: Indices, window_s: float) -> Indices:
         """Return the items of a longer window to decide again; empty if that is useless.

@@ -9,6 +9,7 @@ from epipole.tasks.algorithms.association.samples import Groups
 from epipole.tasks.algorithms.association.window_groups import Items, WindowGroups
 
 EVERY_S = 6.0
+BRIEFLY_S = 7.5
 
 
 def ten_minutes(seed: int) -> Scene:
@@ -103,10 +104,39 @@ def test_groups_of_no_tracklets_change_nothing():
 def test_a_sure_group_goes_on_where_its_tracklets_end(score, undecided, allowed, continues):
     verdicts = entered(score)
     verdicts.undecided[2:] = np.isin(verdicts.items.tracklet[2:], undecided)
-    verdicts.continue_groups(np.isin(verdicts.items.tracklet, allowed))
+    verdicts.continue_groups(np.isin(verdicts.items.tracklet, allowed), BRIEFLY_S)
     assert (verdicts.group[2] == verdicts.group[3] != -1) == continues
     assert (verdicts.group[4:] == -1).all()
     assert verdicts.undecided[2:4].any() != continues or not undecided
+
+
+@pytest.mark.parametrize(("brief", "continues"), [([0], True), ([0, 1], True), ([], False)])
+def test_an_unsure_group_goes_on_where_its_tracklets_are_seen_briefly(brief, continues):
+    verdicts = entered(score=3.0)
+    items = verdicts.items
+    items.last_ns[2:4] -= np.where(np.isin([0, 1], brief), 15_000_000_000, 0)
+    verdicts.ambiguous[2] = True
+    verdicts.continue_groups(np.ones(10, bool), BRIEFLY_S)
+    assert (verdicts.group[2] == verdicts.group[3] != -1) == continues
+    assert verdicts.ambiguous[2] != continues
+    assert (verdicts.group[4:] == -1).all()
+
+
+@pytest.mark.parametrize("sensors", [(0, 1, 2), (0, 1, 0)])
+def test_a_tracklet_seen_briefly_joins_what_the_others_of_its_group_are_in(sensors):
+    # Tracklets 0 and 1 are one object in the first window, 1 and 2 in the second.
+    window, tracklet = np.repeat([0, 1], 3), np.tile([0, 1, 2], 2)
+    first_ns = window * 30_000_000_000
+    last_ns = first_ns + np.where((tracklet == 0) & (window == 1), 4, 20) * 1_000_000_000
+    items = Items(window, tracklet, np.tile(sensors, 2), first_ns, last_ns, np.full(6, 3))
+    verdicts = WindowGroups(items)
+    verdicts.enter(np.array([0, 1]), np.array([0, 1]), group_of(2, 3.0))
+    verdicts.enter(np.array([4, 5]), np.array([1, 2]), group_of(2, 3.0))
+    verdicts.continue_groups(np.ones(6, bool), BRIEFLY_S)
+    # Its sensor has one tracklet of an object.
+    joins = sensors[2] != sensors[0]
+    assert (verdicts.group[3:] == verdicts.group[4]).tolist() == [joins, True, True]
+    assert verdicts.group[2] == -1
 
 
 def test_a_sure_group_does_not_change_another_one_in_the_next_window():
@@ -114,5 +144,11 @@ def test_a_sure_group_does_not_change_another_one_in_the_next_window():
     verdicts.enter(np.array([3]), np.array([1]), group_of(1, 5.0))
     verdicts.undecided[2] = True
     before = verdicts.group.copy()
-    verdicts.continue_groups(np.ones(10, bool))
+    verdicts.continue_groups(np.ones(10, bool), BRIEFLY_S)
     assert (verdicts.group == before).all()
+
+
+def test_without_items_nothing_goes_on():
+    verdicts = WindowGroups(Items(*np.zeros((6, 0), np.int64)))
+    verdicts.continue_groups(np.zeros(0, bool), BRIEFLY_S)
+    assert not len(verdicts.group)
