@@ -68,8 +68,9 @@ def _head_of(page: str) -> str:
 
 
 def _address(page: str, out: Path) -> str:
+    """Return where a link leads; '' where no browser can go, such as s3://."""
     if "://" in page:
-        return page
+        return page if page.startswith(("http://", "https://")) else ""
     relative = os.path.relpath(page, out.parent)
     return quote(Path(relative).as_posix())
 

@@ -32,7 +32,7 @@ class CalendarNight(NamedTuple):
 
     row : of its table `nights`; None: it cannot be read
     verdict : as its page says, `WELL` or `LOOK`; '' without a page
-    address : of its page, relative to the calendar; '' without a page
+    address : of its page, relative to the calendar; '' without one that a browser can open
     """
 
     date: str

@@ -110,6 +110,10 @@ def test_in_an_object_store_the_report_is_the_same(s3, night_log, prefect, night
     for name in ("a.html", "b.html"):
         report(out, NIGHT, tmp_path / name)
         assert (tmp_path / name).read_text() == stored
+    report(out, None, tmp_path / "nights.html")
+    page = (tmp_path / "nights.html").read_text()
+    assert '<span class="night good"' in page  # as its page says; a browser cannot go to s3://
+    assert "s3://nights/reported/reports" not in page
 
 
 def test_the_trend_is_of_the_nights_before(night_dataset, tmp_path):
