@@ -3,24 +3,25 @@
     python examples/write_log.py my_night.mcap
     epipole info my_night.mcap
 
-Replace the arrays in `main` by yours. What each column means: docs/input.md. Here one sensor in
-a low orbit sees ten points for half a minute, so that the file can be looked at; points that lie
-anywhere are no stars, so a run of it finds none.
+Replace `arrays_of` by your arrays. What each column means: docs/input.md. Here they come from the
+example log beside this file: four sensors that see nine objects for a minute.
 """
 
 import sys
+from pathlib import Path
 
 import numpy as np
 import polars as pl
 
 from epipole.flows import api
 
-SENSOR = "sat1"  # letters, digits, - and _; the same in all three tables
+EXAMPLE = Path(__file__).with_name("four_sensor_geo.mcap")
 
 
-def frames_table(time, x_px, y_px, flux, sigma_px):
+def frames_table(sensor, time, x_px, y_px, flux, sigma_px):
     """Return a row per exposure.
 
+    sensor : its id: letters, digits, - and _; the same in all three tables.
     time : (n,) datetime64, the middle of each exposure, UTC.
     x_px, y_px, flux, sigma_px : n arrays, one number for each bright spot of that exposure.
         Pixel (0, 0) is the middle of the top-left pixel, x to the right, y down. Flux is linear
@@ -29,7 +30,7 @@ def frames_table(time, x_px, y_px, flux, sigma_px):
     """
     return pl.DataFrame(
         {
-            "sensor_id": [SENSOR] * len(time),
+            "sensor_id": [sensor] * len(time),
             "time": time,
             "frame_number": np.arange(len(time)),  # it has to grow with time
             "exposure_s": np.full(len(time), 0.2),
@@ -41,7 +42,7 @@ def frames_table(time, x_px, y_px, flux, sigma_px):
     )
 
 
-def states_table(time, r_km, v_km_s):
+def states_table(sensor, time, r_km, v_km_s):
     """Return a row per point of the ephemeris: where the sensor was.
 
     time : (m,) datetime64, UTC; not the times of the frames. A point every few seconds is enough.
@@ -52,7 +53,7 @@ def states_table(time, r_km, v_km_s):
     """
     return pl.DataFrame(
         {
-            "sensor_id": [SENSOR] * len(time),
+            "sensor_id": [sensor] * len(time),
             "time": time,
             **{f"{axis}_km": r_km[:, k] for k, axis in enumerate("xyz")},
             **{f"v{axis}_km_s": v_km_s[:, k] for k, axis in enumerate("xyz")},
@@ -61,17 +62,17 @@ def states_table(time, r_km, v_km_s):
     )
 
 
-def cameras_table(time):
+def cameras_table(sensor, time):
     """Return a row per calibration: the optics from `time` on.
 
     The focal length in pixels follows from the field: width / (2 tan(field / 2)). Distortion
     (k1, k2, p1, p2, k3 of OpenCV) is 0 where it is left out; a run fits it to the stars.
     """
-    width, field_deg = 1024, 8.0
+    width, field_deg = 512, 2.0
     focal_px = width / (2 * np.tan(np.radians(field_deg) / 2))
     return pl.DataFrame(
         {
-            "sensor_id": [SENSOR],
+            "sensor_id": [sensor],
             "time": np.array([time]),
             "width": [width],
             "height": [width],
@@ -83,29 +84,26 @@ def cameras_table(time):
     )
 
 
+def arrays_of(log, sensor):
+    """Return the arrays of a sensor: here those of the example."""
+    frames = log.frames.filter(pl.col("sensor_id") == sensor).sort("time")
+    states = log.states.filter(pl.col("sensor_id") == sensor).sort("time")
+    exposures = [frames[name].to_numpy() for name in ("time", "x_px", "y_px", "flux", "sigma_px")]
+    r_km = states.select("x_km", "y_km", "z_km").to_numpy()
+    v_km_s = states.select("vx_km_s", "vy_km_s", "vz_km_s").to_numpy()
+    return exposures, (states["time"].to_numpy(), r_km, v_km_s)
+
+
 def main(path):
     """Write the log."""
-    rng = np.random.default_rng(1)
-    start = np.datetime64("2031-04-01T04:00:00", "ns")
-
-    # Your exposures: one every second.
-    time = start + np.arange(30) * np.timedelta64(1, "s")
-    x_px, y_px = rng.uniform(0, 1023, (2, len(time), 10))
-    flux = rng.uniform(1e3, 1e5, (len(time), 10))
-    sigma_px = np.full((len(time), 10), 0.1)
-
-    # Your ephemeris: a circle of 7000 km around the Earth, a point every ten seconds.
-    state_time = start + np.arange(-1, 5) * np.timedelta64(10, "s")
-    angle = (state_time - start) / np.timedelta64(1, "s") * 7.546 / 7000
-    r_km = 7000 * np.column_stack([np.cos(angle), np.sin(angle), 0 * angle])
-    v_km_s = 7.546 * np.column_stack([-np.sin(angle), np.cos(angle), 0 * angle])
-
-    api.write_log(
-        path,
-        frames_table(time, x_px, y_px, flux, sigma_px),
-        states_table(state_time, r_km, v_km_s),
-        cameras_table(start),
-    )
+    example = api.read_log(EXAMPLE)
+    frames, states, cameras = [], [], []
+    for sensor in sorted(example.frames["sensor_id"].unique()):
+        exposures, ephemeris = arrays_of(example, sensor)
+        frames.append(frames_table(sensor, *exposures))
+        states.append(states_table(sensor, *ephemeris))
+        cameras.append(cameras_table(sensor, exposures[0][0]))
+    api.write_log(path, *(pl.concat(tables) for tables in (frames, states, cameras)))
 
     # Read it again: what could not be used would stand in `rejects`, with its reason.
     log = api.read_log(path)

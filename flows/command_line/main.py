@@ -15,7 +15,7 @@ from typing import Annotated, Any, NoReturn
 import typer
 import typer.core
 
-from epipole.flows.command_line import nights, run, simulate, tools
+from epipole.flows.command_line import nights, prune, run, simulate, tools
 from epipole.flows.command_line.options import help_text
 from epipole.flows.command_line.process import (
     prepare_environment,
@@ -118,6 +118,7 @@ def _options(
 app.command(help=help_text(run.run))(run.run)  # shows by itself what it compiles
 for command in (
     nights.nights,
+    prune.prune,
     tools.info,
     tools.doctor,
     tools.calibrate,

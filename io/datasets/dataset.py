@@ -252,6 +252,28 @@ def read_beside(dataset: Where, folder: str, schema: pa.Schema) -> list[dict[str
     return rows
 
 
+def sizes(dataset: Where) -> dict[str, int]:
+    """Return the bytes of each night (``night=DATE``), and of its files in `reports` and `runs`."""
+    storage = night_storage(dataset)
+    with reading(dataset, storage.errors):
+        return storage.sizes()
+
+
+def remove(dataset: Where, names: Sequence[str]) -> None:
+    """Remove nights and files that `sizes` names; a reader meets whole nights or none.
+
+    Raises
+    ------
+    DatasetError
+        Where a run works on one of the nights, or something cannot be removed.
+    """
+    nights = [name.removeprefix("night=") for name in names if name.startswith("night=")]
+    storage = night_storage(dataset)
+    with lock_nights(dataset, nights) as run, _writing(dataset, storage):
+        for name in names:
+            storage.remove(name, run)
+
+
 @contextlib.contextmanager
 def lock_nights(dataset: Where, nights: Sequence[str]) -> Iterator[Path]:
     """Lock these nights for this run: no other run can work on them.

@@ -196,6 +196,21 @@ class LocalNights:
         """Return the Parquet files in a folder beside the nights, in order."""
         return sorted((self.folder / folder).absolute().glob("[!.]*.parquet"))
 
+    def sizes(self) -> dict[str, int]:
+        """Return the bytes of each night, and of each file beside the nights."""
+        found = {f"night={n}": _bytes_in(self._night(n)) for n in self.nights()}
+        for beside in (REPORTS, RUNS):
+            for file in sorted((self.folder / beside).glob("[!.]*")):
+                if is_night(file.stem) and file.is_file() and not file.is_symlink():
+                    found[f"{beside}/{file.name}"] = file.lstat().st_size
+        return found
+
+    def remove(self, name: str, run: Path) -> None:
+        """Remove a night or a file: by one rename into the folder of a run."""
+        refuse_link((self.folder / name).parent)
+        refuse_link(self.folder / name)
+        (self.folder / name).rename(run / name.replace("/", "-"))
+
     @contextlib.contextmanager
     def lock_nights(self, nights: Sequence[str]) -> Iterator[Path]:
         """Lock these nights, and yield a folder for this run on the dataset's file system."""
@@ -234,6 +249,10 @@ class LocalNights:
             _clear(self.folder, staging)
             check()
             _put_all_in_place(self.folder, staged)
+
+
+def _bytes_in(folder: Path) -> int:
+    return sum(path.lstat().st_size for path in folder.rglob("*") if path.is_file())
 
 
 def _umask() -> int:

@@ -28,6 +28,7 @@ from typing import Any
 import pyarrow as pa
 
 from epipole.io.caches.private_folders import temporary_folder
+from epipole.io.datasets.local import REPORTS, RUNS
 from epipole.io.datasets.lock_record import STAGING, LockRecord
 from epipole.io.paths import file_system, line_of, storage_errors
 from epipole.schemas.dates import is_night
@@ -275,6 +276,26 @@ class StoreNights:
         """Return the Parquet files in a folder beside the nights, in order."""
         paths = sorted(self._storage.glob(f"{self._root}/{folder}/*.parquet"))
         return [pa.BufferReader(bytes(self._storage.cat_file(path))) for path in paths]
+
+    def sizes(self) -> dict[str, int]:
+        """Return the bytes of each night, and of each file beside the nights."""
+        found: dict[str, int] = {}
+        self._storage.invalidate_cache()
+        for path, entry in self._storage.find(self._root, detail=True).items():
+            first, _, rest = path.removeprefix(f"{self._root}/").partition("/")
+            if is_night(first.removeprefix("night=")) and first.startswith("night="):
+                found[first] = found.get(first, 0) + (entry["size"] or 0)
+            elif first in (REPORTS, RUNS) and is_night(rest.partition(".")[0]):
+                found[f"{first}/{rest}"] = entry["size"] or 0
+        return dict(sorted(found.items()))
+
+    def remove(self, name: str, run: Path) -> None:
+        """Remove a night or a file; of a night `sources` first: without it no night is complete."""
+        where = f"{self._root}/{name}"
+        if name.startswith("night="):
+            with contextlib.suppress(FileNotFoundError):
+                self._storage.rm(f"{where}/sources", recursive=True)
+        self._storage.rm(where, recursive=name.startswith("night="))
 
     @contextlib.contextmanager
     def lock_nights(self, nights: Sequence[str]) -> Iterator[Path]:

@@ -51,6 +51,12 @@ class NightStorage(Protocol):
     def files_beside(self, folder: str) -> Sequence[Any]:
         """Return the Parquet files in a folder beside the nights, as pyarrow reads them."""
 
+    def sizes(self) -> dict[str, int]:
+        """Return the bytes of each night (``night=DATE``), and of each file beside the nights."""
+
+    def remove(self, name: str, run: Path) -> None:
+        """Remove what `sizes` names; `run` is the folder of this run."""
+
     def lock_nights(self, nights: Sequence[str]) -> contextlib.AbstractContextManager[Path]:
         """Lock nights for this run, and yield an empty folder for it; see `dataset.lock_nights`."""
 

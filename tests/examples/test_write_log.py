@@ -17,13 +17,13 @@ def run(*command, folder):
 @pytest.mark.long
 def test_the_log_is_what_info_finds(tmp_path):
     said = run(sys.executable, EXAMPLE, "my.mcap", folder=tmp_path)
-    assert said.splitlines() == ["my.mcap: 30 frames, 6 states", "nothing was left out"]
+    assert said.splitlines() == ["my.mcap: 240 frames, 260 states", "nothing was left out"]
     program = Path(sys.executable).with_name("epipole")
     (found,) = json.loads(run(program, "info", "my.mcap", "--json", folder=tmp_path))
-    (sensor,) = found["sensors"]
     assert found["left_out"] == []
-    assert (sensor["sensor_id"], sensor["frames"], sensor["states"]) == ("sat1", 30, 6)
-    assert sensor["rate_hz"] == 1.0
-    assert sensor["image_px"] == [1024, 1024]
-    assert sensor["states_with_velocity"] == 6
-    assert all(abs(side - 8.0) < 1e-6 for side in sensor["field_deg"])
+    assert [sensor["sensor_id"] for sensor in found["sensors"]] == ["sat1", "sat2", "sat3", "sat4"]
+    sensor = found["sensors"][0]
+    assert (sensor["frames"], sensor["states"], sensor["states_with_velocity"]) == (60, 65, 65)
+    assert sensor["image_px"] == [512, 512]
+    ran = run(program, "run", "my.mcap", "--out", "out", "--quiet", "--json", folder=tmp_path)
+    assert (json.loads(ran)["identified"], json.loads(ran)["objects"]) == (240, 9)
