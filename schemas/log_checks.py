@@ -107,6 +107,12 @@ class LogCheck(StrEnum):
         "written; only a run compares them.",
         "{percent:.3g} % of its views meet those of other sensors",
     )
+    UTC_TIMES = (
+        "utc_times",
+        "Written times minus UTC, by satellites of the catalogue; only a run with one compares "
+        "them.",
+        "times are UTC within {within_s:.2g} s, by {known:.0f} tracklets of known satellites",
+    )
 
 
 class LogCause(StrEnum):
@@ -447,6 +453,19 @@ class LogCause(StrEnum):
         CheckVerdict.UNKNOWN,
         "{percent:.3g} % of its views meet those of other sensors, and no ordinary mistake "
         "explains it: they look at other objects, or the mistake is not known",
+        "",
+    )
+    TIMES_NOT_UTC = (
+        "times_not_utc",
+        CheckVerdict.WRONG,
+        "{known:.0f} of {tracklets:.0f} tracklets are known satellites if all times are "
+        "{value:+.1f} s from UTC, {as_written:.0f} as they are written: {scale}",
+        "write UTC in frames and states",
+    )
+    FEW_KNOWN_SATELLITES = (
+        "few_known_satellites",
+        CheckVerdict.UNKNOWN,
+        "{known:.0f} of {tracklets:.0f} tracklets are known satellites, which is too few to tell",
         "",
     )
 

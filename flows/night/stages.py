@@ -37,6 +37,7 @@ from epipole.tasks.check.correct_clock import correct_clock
 from epipole.tasks.common.batches import FRAMES_OF_TASK, in_batches
 from epipole.tasks.identify.identify_span import Counts, SpanToIdentify, identify_spans
 from epipole.tasks.name.elements_of_night import ElementsOfNight, elements_of_night
+from epipole.tasks.name.judge_times import judge_times
 from epipole.tasks.name.known_objects import name_known_objects
 from epipole.tasks.name.link_tracklets import OrbitLinks, link_tracklets
 from epipole.tasks.name.object_ids import (
@@ -378,7 +379,12 @@ def name_known(
     earlier: pa.Table,
     settings: Settings,
 ) -> list[SensorResidual]:
-    """Name the known objects of a night whose tables are written; see `name_known_objects`."""
+    """Name the known objects of a night whose tables are written; see `name_known_objects`.
+
+    With a catalogue, its `checks` get rows on whether the night's times are UTC.
+    """
+    if known is not None:
+        results(Stage.PUBLISH, [judge_times.submit(folder, known)])
     future = name_known_objects.submit(
         folder, known, earlier, settings.known_objects, settings.states.link_log_odds
     )

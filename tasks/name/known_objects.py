@@ -178,14 +178,18 @@ def observed_objects(folder: Path) -> tuple[dict[str, Observed], dict[str, tuple
     return found, {name: (first, last) for name, first, last in spans.iter_rows()}
 
 
+def catalogue_of(known: ElementsOfNight) -> KnownSatellites:
+    """Return the catalogue with usual errors of its elements."""
+    epoch_ns = np.array([each.epoch_ns for each in known.sets], np.int64)
+    return KnownSatellites(satellites_of(known.elements), epoch_ns, LOW_ORBIT, HIGH_ORBIT)
+
+
 def judge_objects(
     observed: Mapping[str, Observed], known: ElementsOfNight, least: float
 ) -> tuple[dict[str, NameVerdict], KnownSatellites]:
     """Return what each object is, and the catalogue with the errors that the sure matches show."""
-    satellites = satellites_of(known.elements)
-    epoch_ns = np.array([each.epoch_ns for each in known.sets], np.int64)
-    catalogue = KnownSatellites(satellites, epoch_ns, LOW_ORBIT, HIGH_ORBIT)
-    screen = Screen(satellites)
+    catalogue = catalogue_of(known)
+    screen = Screen(catalogue.satellites)
     first = {name: candidates(of, catalogue, screen) for name, of in observed.items()}
     judged = [judge(found, SURE) for found in first.values()]
     sure = [each.best for each in judged if each.status == "known" and each.best is not None]

@@ -44,6 +44,10 @@ _COLUMNS = [
 ]  # fmt: skip
 
 
+# Whether a tracklet has a direction with rates, and its sensor a position and velocity.
+HAS_DIRECTION = pl.all_horizontal(pl.col("epoch", "cov_rara", *POSITION, *VELOCITY).is_not_null())
+
+
 class NamedTracklets(NamedTuple):
     """Objects and tracklets of a night, and their names.
 
@@ -82,10 +86,7 @@ def name_tracklets(
     rows = pl.DataFrame(read_columns(folder, "tracklets", _COLUMNS))
     is_named = pl.col("object_id").is_in(list(objects)).fill_null(False)
     rows = rows.filter(~is_named).sort("tracklet_id")
-    has_orbit = rows.select(
-        pl.all_horizontal(pl.col("epoch", "cov_rara", *POSITION, *VELOCITY).is_not_null())
-    ).to_series()
-    compared = np.flatnonzero(has_orbit.to_numpy())
+    compared = np.flatnonzero(rows.select(HAS_DIRECTION).to_series().to_numpy())
     tracklets = _tracklets(rows[compared])
     pairs = match_tracklets(tracklets, catalogue)
     catalogue = _learnt(tracklets, pairs, catalogue)
@@ -99,6 +100,13 @@ def name_tracklets(
     object_id = rows["object_id"].gather(kept)
     tracklet_id = rows["tracklet_id"].gather(kept).set(object_id.is_not_null(), None)
     return NamedTracklets(object_id.to_list(), tracklet_id.to_list(), kept, names, pairs, weights)
+
+
+def sampled_tracklets(folder: Path, most: int) -> SeenTracklets:
+    """Return at most so many of a night's tracklets, evenly chosen."""
+    rows = pl.DataFrame(read_columns(folder, "tracklets", _COLUMNS)).sort("tracklet_id")
+    rows = rows.filter(HAS_DIRECTION)
+    return _tracklets(rows[:: max(-(-len(rows) // most), 1)])
 
 
 def _fits_all(

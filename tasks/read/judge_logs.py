@@ -51,6 +51,7 @@ _LEFT_OUT = {
     Reason.UNKNOWN_FRAME: LogCause.UNKNOWN_FRAME_NAME,
 }
 _SCALES = {
+    0.0: "no time scale in use is that far from UTC",
     GPS_S: "GPS and UTC differ by 18 s",
     TAI_GPS_S: "TAI and GPS differ by 19 s",
     TAI_S: "TAI and UTC differ by 37 s",

@@ -74,6 +74,10 @@ def test_two_thirds_of_an_aged_catalogue_are_named_and_the_rest_is_unknown(log, 
     rejects = rows_of(out, table="rejects").filter(pl.col("stage") == "name")
     assert set(rejects["reason"]) == {"other_elements", "old_elements"}
     assert rejects["source"].to_list() == ["catalogue.json"] * 2
+    times = rows_of(out, table="checks").filter(pl.col("check") == "utc_times")
+    assert len(times) == summary.sensors
+    assert set(times["verdict"]) == {"sound"}
+    assert (times["value"].abs() < 3 * times["sigma"]).all()
 
 
 def test_an_old_catalogue_is_told_in_one_line_and_names_nothing(log, tmp_path, caplog):
