@@ -103,7 +103,7 @@ def name_tracklets(
 
 
 def sampled_tracklets(folder: Path, most: int) -> SeenTracklets:
-    """Return at most so many of a night's tracklets, evenly chosen."""
+    """Return at most `most` of a night's tracklets, evenly chosen."""
     rows = pl.DataFrame(read_columns(folder, "tracklets", _COLUMNS)).sort("tracklet_id")
     rows = rows.filter(HAS_DIRECTION)
     return _tracklets(rows[:: max(-(-len(rows) // most), 1)])
