@@ -296,7 +296,8 @@ def test_a_run_reads_from_a_bucket_and_publishes_to_one(s3, out, prefect, night_
         assert [night.stale for night in published_nights(out, Settings(), None)] == [[]]
     assert evaluate(out, night_log).as_dict() == evaluate(night_dataset, night_log).as_dict()
     others = [path for path in s3.find(out) if "/night=" not in path]
-    assert [path.rpartition("/ds/")[2] for path in others] == [f"reports/{NIGHT}.html"]
+    beside = [f"reports/{NIGHT}.html", f"runs/{NIGHT}.parquet", "runs/last.prom"]
+    assert sorted(path.rpartition("/ds/")[2] for path in others) == beside
 
 
 def test_a_store_that_is_not_there_is_an_error_of_one_line(s3, out, monkeypatch):
