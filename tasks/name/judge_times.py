@@ -62,22 +62,23 @@ def judge_times(folder: Path, known: ElementsOfNight) -> None:
     if not (len(tracklets.time_ns) and known.sets and sensors):
         return
     offset = find_time_offset(tracklets, catalogue_of(known), IN_USE_S)
-    found = _finding(offset, len(tracklets.time_ns))
+    found = finding_of(offset, len(tracklets.time_ns))
     if found.verdict == WRONG:
         LOGGER.warning("all sensors: %s", sentence_of(found))
     rows = checks_table({name: [found] for name in sensors})
     write_table(folder, "checks", [concat(CHECKS, [checks, rows])])
 
 
-def _finding(offset: TimeOffset, n_tracklets: int) -> Finding:
+def finding_of(offset: TimeOffset, n_tracklets: int) -> Finding:
+    """Return what an offset of the times says, found with `n_tracklets`."""
     value, sigma = offset.offset_s, offset.sigma_s
     facts = {
         "known": offset.n_known, "as_written": offset.n_as_written, "tracklets": n_tracklets,
-        "offset_s": known_offset(value), "within_s": abs(value) + 2 * sigma,
     }  # fmt: skip
-    found = Finding(UTC_TIMES, SOUND, value, sigma, 0.0, "s", facts=facts)
     if offset.n_known < max(MIN_KNOWN, MIN_SHARE * n_tracklets):
         return Finding(UTC_TIMES, UNKNOWN, cause="few_known_satellites", facts=facts)
+    facts |= {"offset_s": known_offset(value), "within_s": abs(value) + 2 * sigma}
+    found = Finding(UTC_TIMES, SOUND, value, sigma, 0.0, "s", facts=facts)
     if abs(value) > max(MIN_OFFSET_S, MIN_SIGMAS * sigma):
         return found._replace(verdict=WRONG, cause="times_not_utc")
     return found
