@@ -72,7 +72,7 @@ def judge_times(folder: Path, known: ElementsOfNight) -> None:
 def finding_of(offset: TimeOffset, n_tracklets: int) -> Finding:
     """Return what an offset of the times says, found with `n_tracklets`."""
     value, sigma = offset.offset_s, offset.sigma_s
-    facts = {
+    facts: dict[str, float] = {
         "known": offset.n_known, "as_written": offset.n_as_written, "tracklets": n_tracklets,
     }  # fmt: skip
     if offset.n_known < max(MIN_KNOWN, MIN_SHARE * n_tracklets):
