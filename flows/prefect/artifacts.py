@@ -288,6 +288,9 @@ def _errors_in_one_line() -> Iterator[None]:
         return True
 
     loggers = [logging.getLogger(name) for name in ("prefect.flow_runs", "prefect.task_runs")]
+    # For good: in a deployment Prefect's engine writes its last lines after the flow.
+    for logger in (loggers[0], logging.getLogger("prefect.engine")):
+        logger.addFilter(_is_no_epipole_error)
     for logger in loggers:
         logger.addFilter(shorten)
     try:
@@ -295,6 +298,13 @@ def _errors_in_one_line() -> Iterator[None]:
     finally:
         for logger in loggers:
             logger.removeFilter(shorten)
+
+
+def _is_no_epipole_error(record: logging.LogRecord) -> bool:
+    """Return whether a line is not about an error that the run's state has said already."""
+    is_last = "exited with unexpected exception" in str(record.msg)
+    error = record.exc_info[1] if record.exc_info else None
+    return not (is_last and isinstance(error, EpipoleError))
 
 
 class _RunLog(APILogHandler):

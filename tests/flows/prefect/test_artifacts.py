@@ -1,6 +1,7 @@
 """Artifacts of a night on Prefect's page, and a page that cannot be written."""
 
 import json
+import logging
 import re
 
 import httpx
@@ -13,6 +14,7 @@ from epipole.flows.night.summary import Summary
 from epipole.flows.nightly import nightly
 from epipole.flows.prefect import artifacts
 from epipole.flows.prefect.artifacts import ProgressBar, as_markdown, show_summary, shown_on_page
+from epipole.schemas.errors import LogError
 from epipole.schemas.rejects import Reason
 from epipole.schemas.stages import Stage
 from epipole.tasks.report.frame_series import Gap
@@ -183,3 +185,18 @@ def test_a_run_that_fails_says_so_and_leaves_no_handler(monkeypatch):
         failing()
     assert shown[-1][2] == "failed; see the log"
     assert ([*ROOT.handlers], [*STEPS.handlers], ROOT.level) == before
+
+
+def test_an_error_that_a_user_can_put_right_is_one_line_of_the_log(prefect, tmp_path, caplog):
+    state = nightly(str(tmp_path / "none.mcap"), str(tmp_path / "out"), return_state=True)
+    assert state.is_failed()
+    assert state.message.endswith("none.mcap: no such file; check the path")
+    lines = [record for record in caplog.records if record.name == "prefect.flow_runs"]
+    assert not [record for record in lines if record.exc_info]
+    assert sum("no such file" in record.getMessage() for record in lines) == 1
+    for name in ("prefect.engine", "prefect.flow_runs"):
+        for error, seen in ((LogError("x"), 0), (RuntimeError("x"), 1)):
+            caplog.clear()
+            said = "Engine execution exited with unexpected exception"
+            logging.getLogger(name).error(said, exc_info=(type(error), error, None))
+            assert len([record for record in caplog.records if record.name == name]) == seen
