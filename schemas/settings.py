@@ -554,4 +554,8 @@ def _meant(unknown: str) -> str:
     else:
         names, key = list(fields), unknown
     near = get_close_matches(key, names, n=1)
+    if not near:  # it may be a setting of another group
+        groups = Settings().model_dump()
+        whole = {name: f"{g}.{name}" for g, values in groups.items() for name in values}
+        near = [whole[name] for name in get_close_matches(key.rpartition(".")[2], whole, n=1)]
     return f" (did you mean {near[0]}?)" if near else ""

@@ -55,3 +55,17 @@ def test_settings_that_contradict_each_other_are_refused(text, says):
 def test_a_flow_gets_the_same_checks():
     with pytest.raises(ValueError, match="is not below"):
         Settings.model_validate({"association": {"min_altitude_km": 2e5}})
+
+
+@pytest.mark.parametrize(
+    ("values", "meant"),
+    [
+        ({"sensors": {"state_gap": 1}}, "state_gap_s"),
+        ({"sensor": {}}, "sensors"),
+        ({"max_rate_deg": 4}, "tracklets.max_rate_deg_s"),
+        ({"sensors": {"max_rate_deg_s": 4}}, "tracklets.max_rate_deg_s"),
+    ],
+)
+def test_a_misspelt_or_misplaced_setting_has_a_suggestion(values, meant):
+    with pytest.raises(SettingsError, match=rf"did you mean {meant}\?"):
+        validate_settings(values, "settings.toml")
