@@ -61,7 +61,10 @@ def doctor(logs: Sequence[str], settings: Settings = Settings()) -> Diagnosis:  
     given = find_logs(logs, None)
     with temporary_folder("doctor") as made:
         folder = ReadFolder(made)
-        read = [read_log_into(folder, k, path) for k, path in enumerate(given.paths)]
+        read = [
+            read_log_into(folder, k, path, settings.sensors.assume)
+            for k, path in enumerate(given.paths)
+        ]
         frames = order_logs(folder, read, settings.sensors)
         if not frames.sensors and not frames.rejects.num_rows:
             raise LogError(

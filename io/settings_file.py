@@ -7,7 +7,8 @@ from typing import Any
 
 from epipole.io.paths import known_as, open_remote, refuse_device
 from epipole.schemas.errors import LogError, SettingsError
-from epipole.schemas.settings import Group, Settings, parse_settings, validate_settings
+from epipole.schemas.given_settings import parse_settings, validate_settings
+from epipole.schemas.settings import Group, Settings
 
 WIDTH = 88
 

@@ -460,7 +460,7 @@ class LogCause(StrEnum):
         CheckVerdict.WRONG,
         "{known:.0f} of {tracklets:.0f} tracklets are known satellites if all times are "
         "{value:+.1f} s from UTC, {as_written:.0f} as they are written: {scale}",
-        "write UTC in frames and states",
+        "write UTC in frames and states, or assume the time scale (`--assume`)",
     )
     FEW_KNOWN_SATELLITES = (
         "few_known_satellites",

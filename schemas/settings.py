@@ -4,12 +4,10 @@ They come from a TOML file or from flow parameters. They are passed in, never re
 """
 
 import hashlib
-from difflib import get_close_matches
-from typing import TYPE_CHECKING, Any, Literal, Self
+from typing import TYPE_CHECKING, Literal, Self
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import BaseModel, ConfigDict, Field, model_validator
 
-from epipole.schemas.errors import SettingsError
 from epipole.schemas.log_bounds import ATTITUDE_SIGMA, POSITION_SIGMA
 from epipole.schemas.options import (
     ASSOCIATION,
@@ -18,7 +16,6 @@ from epipole.schemas.options import (
     STAR_IDENTIFICATION,
     TRACK_LINKING,
 )
-from epipole.schemas.text import as_line, toml_values
 
 _BUILT_IN = ", ".join(f'"{name}"' for name, source in STAR_CATALOGUES.items() if source.for_runs)
 
@@ -32,7 +29,6 @@ else:  # the names that the registries list
     AssociationMethod = Literal[tuple(ASSOCIATION)]
 
 
-LONGEST_VALUE = 80  # of an invalid value in a message
 # Bounds beyond which no sensor and no object is; a larger value is a slip of the pen.
 DAY_S = 86_400
 FARTHEST_KM = 1e6  # twice as far as the Moon
@@ -45,6 +41,33 @@ class Group(BaseModel):
     """A frozen group of settings. An unknown name is an error."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+
+EVERY_SENSOR = "*"
+
+
+class Assumption(Group):
+    """How a sensor's log is read, in place of what it states: the cure of a mistake in it."""
+
+    sensor: str = Field(
+        EVERY_SENSOR, min_length=1, max_length=63, description="Its id; `*`: every sensor."
+    )
+    time: Literal["utc", "gps", "tai"] = Field(
+        "utc", description="Time scale of its frames, states and calibrations."
+    )
+    ahead_s: float = Field(
+        0.0,
+        ge=-DAY_S,
+        le=DAY_S,
+        description="By how much these times are ahead of their time scale, such as 3600 for "
+        "local time.",
+    )
+    states: Literal["as stated", "GCRF", "EME2000", "TEME", "ITRF"] = Field(
+        "as stated", description="Reference frame of its states."
+    )
+    velocities: Literal["as stated", "unknown"] = Field(
+        "as stated", description="Unknown: they come from its positions."
+    )
 
 
 class SensorSettings(Group):
@@ -83,6 +106,14 @@ class SensorSettings(Group):
         gt=0,
         le=DAY_S,
         description="A frame farther than this from the nearest state gets no position.",
+    )
+    assume: tuple[Assumption, ...] = Field(
+        (),
+        description="How logs are read in place of what they state, where they were written "
+        'otherwise: `{ sensor = "sat1", time = "gps" }` each. `sensor` is an id, or `*` for every '
+        "sensor; `time` is utc, gps or tai; `ahead_s` seconds by which these times are ahead "
+        "besides; `states` GCRF, EME2000, TEME or ITRF; `velocities` unknown. A sensor takes all "
+        "that name it.",
     )
     expected: tuple[str, ...] | None = Field(
         None,
@@ -509,53 +540,3 @@ def _contradiction(settings: Settings) -> str | None:
             f"association.max_range_km = {association.max_range_km:g}"
         )
     return None
-
-
-def parse_settings(text: str, where: str) -> Settings:
-    """Return the settings of a TOML text; `where` names it in messages.
-
-    Raises
-    ------
-    SettingsError
-        Names the setting, the value given and the value expected.
-    """
-    try:
-        values = toml_values(text)
-    except ValueError as error:
-        raise SettingsError(f"{where}: not TOML: {error}") from error
-    return validate_settings(values, where)
-
-
-def validate_settings(values: dict[str, Any], where: str) -> Settings:
-    """Return the settings of nested mappings, such as flow parameters; see `parse_settings`."""
-    try:
-        return Settings.model_validate(values)
-    except ValidationError as error:
-        raise SettingsError(f"{where}: {_first_fault(error)}") from error
-
-
-def _first_fault(error: ValidationError) -> str:
-    fault = error.errors()[0]
-    if not fault["loc"] and "ctx" in fault:  # of several settings
-        return str(fault["ctx"]["error"])
-    name = as_line(".".join(str(part) for part in fault["loc"]), LONGEST_VALUE)
-    value = as_line(repr(fault["input"]), LONGEST_VALUE)
-    if fault["type"] == "extra_forbidden":
-        return f"unknown setting {name}{_meant(name)}; `epipole settings` lists them all"
-    return f"{name} = {value}: {fault['msg'][0].lower()}{fault['msg'][1:]}"
-
-
-def _meant(unknown: str) -> str:
-    """Return the group, or the setting of its group, that is most like an unknown name."""
-    group, _, key = unknown.rpartition(".")
-    fields = Settings.model_fields
-    if group in fields and (settings := fields[group].annotation) is not None:
-        names = list(settings.model_fields)
-    else:
-        names, key = list(fields), unknown
-    near = get_close_matches(key, names, n=1)
-    if not near:  # it may be a setting of another group
-        groups = Settings().model_dump()
-        whole = {name: f"{g}.{name}" for g, values in groups.items() for name in values}
-        near = [whole[name] for name in get_close_matches(key.rpartition(".")[2], whole, n=1)]
-    return f" (did you mean {near[0]}?)" if near else ""

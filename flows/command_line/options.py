@@ -15,6 +15,14 @@ from epipole.schemas.text import as_line
 Logs = Annotated[
     list[str], typer.Argument(metavar="LOG", help="MCAP files, folders, glob patterns or URLs.")
 ]
+Assume = Annotated[
+    list[str] | None,
+    typer.Option(
+        metavar="SENSOR.NAME=VALUE",
+        help="Read a sensor's log otherwise than it states: sat1.time=gps, *.states=TEME, "
+        "sat1.velocities=unknown; as the settings sensors.assume. More than once, if need be.",
+    ),
+]
 AsJson = Annotated[bool, typer.Option("--json", help="Print JSON on standard output.")]
 
 

@@ -10,7 +10,14 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from epipole.flows.command_line.options import AsJson, Logs, check_night, print_json, print_lines
+from epipole.flows.command_line.options import (
+    AsJson,
+    Assume,
+    Logs,
+    check_night,
+    print_json,
+    print_lines,
+)
 from epipole.flows.prefect.server_process import Launched, launch
 from epipole.schemas.dates import LAST_NIGHTS, YESTERDAY, nights_before
 from epipole.schemas.options import Runner
@@ -31,6 +38,7 @@ def run(
         Path | None,
         typer.Option(metavar="FILE", help="Settings in TOML; `epipole settings` prints them all."),
     ] = None,
+    assume: Assume = None,
     night: Annotated[
         str | None,
         typer.Option(
@@ -105,7 +113,16 @@ def run(
     from epipole.flows.command_line.run_nightly import Nights, RunOptions
 
     options = RunOptions(
-        settings, replace, known, again, runner, workers, scheduler, quiet, verbose
+        settings,
+        replace,
+        known,
+        again,
+        runner,
+        workers,
+        scheduler,
+        quiet,
+        verbose,
+        tuple(assume or ()),
     )
     nights = Nights(logs, out, options, early)
     if len(dates) == 1 and to is None and not stale:

@@ -28,6 +28,7 @@ from epipole.io.datasets.dataset import check_folder, night_location, nights_in
 from epipole.io.logs.listing import list_logs
 from epipole.io.settings_file import read_settings
 from epipole.schemas.errors import EpipoleError, NoFramesError
+from epipole.schemas.given_settings import with_assumptions
 from epipole.schemas.options import Runner
 from epipole.schemas.run_record import RunState
 from epipole.schemas.settings import Settings
@@ -50,6 +51,7 @@ class RunOptions:
     scheduler: str | None = None
     quiet: bool = False
     verbose: bool = False
+    assume: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -101,7 +103,8 @@ class Nights:
             Where one of them cannot be used.
         """
         self._logs, self._out, self._options, self._early = logs, out, options, early
-        self._settings = read_settings(options.settings) if options.settings else Settings()
+        written = read_settings(options.settings) if options.settings else Settings()
+        self._settings = with_assumptions(written, options.assume)
         check_folder(out)
         check_star_catalogue(self._settings.identification.catalogue)
         known = read_known_objects(options.known) if options.known is not None else None

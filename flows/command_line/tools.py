@@ -14,6 +14,7 @@ import typer
 
 from epipole.flows.command_line.options import (
     AsJson,
+    Assume,
     Logs,
     check_night,
     help_text,
@@ -333,7 +334,7 @@ def info(logs: Logs, as_json: AsJson = False) -> None:
         print_lines(line for log in described for line in lines(log))
 
 
-def doctor(logs: Logs, as_json: AsJson = False) -> None:
+def doctor(logs: Logs, assume: Assume = None, as_json: AsJson = False) -> None:
     """Check how logs were written, and name ordinary mistakes, each with its cure.
 
     For each sensor: units and reference frame of its states, velocities against positions,
@@ -343,8 +344,10 @@ def doctor(logs: Logs, as_json: AsJson = False) -> None:
     """
     from epipole.flows.doctor import as_dict, lines
     from epipole.flows.doctor import doctor as examine
+    from epipole.schemas.given_settings import with_assumptions
+    from epipole.schemas.settings import Settings
 
-    found = examine(logs)
+    found = examine(logs, with_assumptions(Settings(), assume or ()))
     if as_json:
         print_json(as_dict(found))
     else:

@@ -75,7 +75,7 @@ def read(logs: Sequence[str], folder: ReadFolder, settings: Settings) -> Ordered
     """Read the logs, some per task, and order the frames and states of each sensor."""
     to_read = [LogToRead(number, log) for number, log in enumerate(logs)]
     batches = in_batches(to_read, [FRAMES_OF_TASK] * len(logs))
-    futures = [read_logs.submit(folder, batch) for batch in batches]
+    futures = [read_logs.submit(folder, batch, settings.sensors.assume) for batch in batches]
     plan = plan_order(folder, flat(results(Stage.READ, futures, (0, 2))))
     futures = [order_sensors.submit(folder, batch, settings.sensors) for batch in plan.batches()]
     frames = ordered_logs(plan, flat(results(Stage.READ, futures, (1, 2))), settings.sensors)

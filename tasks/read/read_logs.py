@@ -1,6 +1,7 @@
 """Read logs: the content of each goes into the work folder, piece by piece."""
 
 import logging
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import pyarrow as pa
@@ -9,10 +10,12 @@ import pyarrow.compute as pc
 from epipole.io.logs.reader import read_log_pieces
 from epipole.io.work.parts import LOG_PIECE, write_part
 from epipole.io.work.work_layout import ReadFolder
+from epipole.schemas.settings import Assumption
 from epipole.schemas.stages import Stage
 from epipole.schemas.work_tables import LogSource
 from epipole.tasks.common.batches import Batch
 from epipole.tasks.common.stage_tasks import stage_task
+from epipole.tasks.read.assume_readings import as_assumed, as_assumed_source
 
 LOGGER = logging.getLogger(__name__)
 
@@ -51,15 +54,20 @@ class ReadLog(NamedTuple):
 
 
 @stage_task(Stage.READ, "{logs}", retried=True)
-def read_logs(folder: ReadFolder, logs: Batch[LogToRead]) -> list[ReadLog]:
+def read_logs(
+    folder: ReadFolder, logs: Batch[LogToRead], assumptions: Sequence[Assumption] = ()
+) -> list[ReadLog]:
     """Read some logs, each into pieces of bounded size; see `read_log_into`."""
-    return [read_log_into(folder, *log) for log in logs]
+    return [read_log_into(folder, *log, assumptions) for log in logs]
 
 
-def read_log_into(folder: ReadFolder, number: int, path: str) -> ReadLog:
+def read_log_into(
+    folder: ReadFolder, number: int, path: str, assumptions: Sequence[Assumption] = ()
+) -> ReadLog:
     """Read one log into pieces of bounded size.
 
-    Each piece holds `exposures`, `states`, `cameras` and `rejects` as `LogPiece` has them.
+    Each piece holds `exposures`, `states`, `cameras` and `rejects` as `LogPiece` has them, read as
+    the settings assume.
 
     Raises
     ------
@@ -68,7 +76,8 @@ def read_log_into(folder: ReadFolder, number: int, path: str) -> ReadLog:
     """
     n_pieces, n_cameras, source = 0, 0, None
     sensors: dict[str, SensorInLog] = {}
-    for piece in read_log_pieces(path):
+    for written in read_log_pieces(path):
+        piece = as_assumed(written, assumptions)
         write_part(
             folder.piece(number, n_pieces),
             LOG_PIECE,
@@ -87,6 +96,7 @@ def read_log_into(folder: ReadFolder, number: int, path: str) -> ReadLog:
         n_cameras += piece.cameras.num_rows
         source = piece.source or source
     assert source is not None, "the last piece has it"
+    source = as_assumed_source(source, sensors, assumptions)
     n_frames = sum(found.n_frames for found in sensors.values())
     LOGGER.debug("%s: read %d frames in %d pieces", source.name, n_frames, n_pieces)
     return ReadLog(number, n_pieces, source, sensors, n_cameras)

@@ -25,8 +25,8 @@ from epipole.flows.simulate import simulate
 from epipole.io.catalogues.hipparcos import read_hipparcos
 from epipole.io.catalogues.star_catalogue import write_star_catalogue
 from epipole.schemas.bridge import array
+from epipole.schemas.given_settings import validate_settings
 from epipole.schemas.scene import validate_scene
-from epipole.schemas.settings import validate_settings
 from epipole.tasks.algorithms.star_identification.frame import FieldOfView
 from epipole.tasks.catalogue import build_deep_catalogue
 from epipole.tasks.identify import cache_skies

@@ -6,7 +6,8 @@ from typing import Any
 from annotated_types import Ge, Gt, Le, Lt
 
 from epipole.schemas.errors import SettingsError
-from epipole.schemas.settings import Settings, parse_settings
+from epipole.schemas.given_settings import parse_settings
+from epipole.schemas.settings import Settings
 
 # As TOML: numbers beyond all bounds, values of other types, text that nobody can print.
 ODD = (

@@ -6,7 +6,8 @@ import pytest
 
 from damage import odd_settings
 from epipole.schemas.errors import SettingsError
-from epipole.schemas.settings import Settings, parse_settings
+from epipole.schemas.given_settings import parse_settings
+from epipole.schemas.settings import Settings
 
 
 def test_every_odd_settings_file_is_taken_or_refused_in_one_line():

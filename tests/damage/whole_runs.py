@@ -23,7 +23,8 @@ from epipole.flows.nightly import nightly
 from epipole.flows.prefect.defaults import embedded_prefect, quiet_console
 from epipole.io.logs.reader import read_log
 from epipole.schemas.errors import EpipoleError
-from epipole.schemas.settings import Settings, validate_settings
+from epipole.schemas.given_settings import validate_settings
+from epipole.schemas.settings import Settings
 
 TWICE = ("duplicate_frame", "duplicate_number", "duplicate_time")
 MAX_CPU_S = 120.0

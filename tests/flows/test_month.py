@@ -16,7 +16,7 @@ from epipole.flows.prefect import artifacts
 from epipole.flows.simulate import simulate
 from epipole.io.logs.reader import read_log
 from epipole.io.logs.writer import LogWriter
-from epipole.schemas.settings import validate_settings
+from epipole.schemas.given_settings import validate_settings
 
 SECOND_NS, DAY_NS = 1_000_000_000, 86_400_000_000_000
 FAST = {"report": {"write": False}, "linking": {"enabled": False}}

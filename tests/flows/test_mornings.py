@@ -13,7 +13,7 @@ from epipole.flows.night.recorded_nights import unchanged_nights
 from epipole.flows.nightly import nightly
 from epipole.io.datasets.dataset import read_table
 from epipole.io.logs.writer import LogWriter
-from epipole.schemas.settings import validate_settings
+from epipole.schemas.given_settings import validate_settings
 
 DAYS = ("2019-04-01", "2019-04-02")
 SECOND_NS = 1_000_000_000

@@ -5,6 +5,7 @@ import inspect
 import pytest
 
 from epipole.schemas.errors import SettingsError
+from epipole.schemas.given_settings import validate_settings
 from epipole.schemas.options import (
     ASSOCIATION,
     STAR_CATALOGUES,
@@ -13,7 +14,7 @@ from epipole.schemas.options import (
     load_function,
     load_method,
 )
-from epipole.schemas.settings import Settings, validate_settings
+from epipole.schemas.settings import Settings
 
 REGISTRIES = {
     "identification.method": STAR_IDENTIFICATION,

@@ -4,7 +4,8 @@ import pytest
 from annotated_types import Ge, Gt, Le, Lt
 
 from epipole.schemas.errors import SettingsError
-from epipole.schemas.settings import Settings, parse_settings, validate_settings
+from epipole.schemas.given_settings import parse_settings, validate_settings
+from epipole.schemas.settings import Settings
 
 NUMBERS = [
     (group, name, field)

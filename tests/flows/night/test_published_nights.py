@@ -9,7 +9,8 @@ from typer.testing import CliRunner
 from epipole.flows.command_line.main import app
 from epipole.flows.night.recorded_nights import published_nights
 from epipole.io.work import recipe
-from epipole.schemas.settings import Settings, validate_settings
+from epipole.schemas.given_settings import validate_settings
+from epipole.schemas.settings import Settings
 
 NIGHT, NEXT = "2019-04-01", "2019-04-02"
 

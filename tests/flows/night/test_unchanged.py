@@ -7,7 +7,8 @@ import pytest
 from epipole.flows.night.log_choice import find_logs
 from epipole.flows.night.recorded_nights import unchanged_nights
 from epipole.io.work import recipe
-from epipole.schemas.settings import Settings, validate_settings
+from epipole.schemas.given_settings import validate_settings
+from epipole.schemas.settings import Settings
 
 NIGHT = "2019-04-01"
 OTHER = validate_settings({"tracklets": {"gate_sigma": 5.0}}, "test")

@@ -1,7 +1,8 @@
 """Recipes: all that a night depends on is in its keys, and nothing else."""
 
 from epipole.io.work.recipe import code_key, digest_of, logs_key, recipe_of
-from epipole.schemas.settings import Settings, validate_settings
+from epipole.schemas.given_settings import validate_settings
+from epipole.schemas.settings import Settings
 
 NIGHT = "2019-04-01"
 A, B = ("a.mcap", "0a"), ("b.mcap", "0b")

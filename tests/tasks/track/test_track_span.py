@@ -10,7 +10,8 @@ from scenes.identified import identified, tracked
 from epipole.flows.command_line.log_info import of_sensor
 from epipole.schemas.bridge import table
 from epipole.schemas.columns import TIME
-from epipole.schemas.settings import Settings, validate_settings
+from epipole.schemas.given_settings import validate_settings
+from epipole.schemas.settings import Settings
 from epipole.schemas.tables import DETECTIONS, STARS
 from epipole.schemas.work_tables import SOLUTIONS
 from epipole.tasks.algorithms.geometry.camera import Camera, unproject

@@ -1,0 +1,90 @@
+"""Assume readings: what the settings say of logs that were written otherwise than they state."""
+
+from collections.abc import Iterable, Sequence
+
+import numpy as np
+import numpy.typing as npt
+import pyarrow as pa
+
+from epipole.schemas.bridge import array
+from epipole.schemas.settings import EVERY_SENSOR, Assumption
+from epipole.schemas.work_tables import LogPiece, LogSource
+from epipole.tasks.algorithms.constants import SECOND_NS
+from epipole.tasks.algorithms.times import tai_minus_utc_s, utc_julian_date
+
+Nanoseconds = npt.NDArray[np.int64]
+
+TAI_MINUS_GPS_S = 19.0  # since 1980: GPS times have no leap seconds
+VELOCITIES = ("vx_km_s", "vy_km_s", "vz_km_s")
+
+
+def as_assumed(piece: LogPiece, assumptions: Sequence[Assumption]) -> LogPiece:
+    """Return a piece of a log as its sensors' assumptions read it.
+
+    A sensor takes all assumptions that name it, or every sensor.
+    """
+    for assumed in assumptions:
+        exposures, states, cameras = (
+            _with_times(rows, assumed) for rows in (piece.exposures, piece.states, piece.cameras)
+        )
+        piece = piece._replace(
+            exposures=exposures, states=_with_states(states, assumed), cameras=cameras
+        )
+    return piece
+
+
+def as_assumed_source(
+    source: LogSource, sensors: Iterable[str], assumptions: Sequence[Assumption]
+) -> LogSource:
+    """Return the source with the time range of these sensors as they are read."""
+    if source.first_time_ns is None or source.last_time_ns is None or not assumptions:
+        return source
+    written = np.array([source.first_time_ns, source.last_time_ns])
+    ends = [written]
+    for sensor in sensors:
+        moved = written
+        for assumed in assumptions:
+            if assumed.sensor in (sensor, EVERY_SENSOR):
+                moved = moved - _ahead_ns(moved, assumed)
+        ends.append(moved)
+    first, last = np.array(ends[1:] or ends).T
+    return source._replace(first_time_ns=int(first.min()), last_time_ns=int(last.max()))
+
+
+def _ahead_ns(time_ns: Nanoseconds, assumed: Assumption) -> Nanoseconds:
+    """Return by how much written times are ahead of UTC."""
+    ahead_s = np.full(len(time_ns), assumed.ahead_s)
+    if assumed.time != "utc":
+        ahead_s += tai_minus_utc_s(utc_julian_date(time_ns)[0])
+    if assumed.time == "gps":
+        ahead_s -= TAI_MINUS_GPS_S
+    return np.round(ahead_s * SECOND_NS).astype(np.int64)
+
+
+def _of_sensor(rows: pa.Table, assumed: Assumption) -> npt.NDArray[np.bool_]:
+    if assumed.sensor == EVERY_SENSOR:
+        return np.ones(rows.num_rows, bool)
+    return np.asarray(array(rows, "sensor_id") == assumed.sensor)
+
+
+def _with_times(rows: pa.Table, assumed: Assumption) -> pa.Table:
+    time_ns = array(rows, "time")
+    moved = time_ns - np.where(_of_sensor(rows, assumed), _ahead_ns(time_ns, assumed), 0)
+    return _with_column(rows, "time", pa.array(moved))
+
+
+def _with_states(states: pa.Table, assumed: Assumption) -> pa.Table:
+    of_sensor = _of_sensor(states, assumed)
+    if assumed.states != "as stated":
+        frame = np.where(of_sensor, assumed.states, array(states, "frame"))
+        states = _with_column(states, "frame", pa.array(frame.tolist(), pa.string()))
+    for name in VELOCITIES if assumed.velocities == "unknown" else ():
+        values = states[name].to_numpy().astype(float)
+        unknown = of_sensor | np.isnan(values)
+        states = _with_column(states, name, pa.array(values, mask=unknown))
+    return states
+
+
+def _with_column(rows: pa.Table, name: str, values: pa.Array) -> pa.Table:
+    field = rows.schema.field(name)
+    return rows.set_column(rows.schema.get_field_index(name), field, values.cast(field.type))

@@ -1,0 +1,111 @@
+"""Assumptions of the settings undo the mistakes of a log."""
+
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import pytest
+
+from epipole.io.logs.reader import read_log_pieces
+from epipole.schemas.bridge import array
+from epipole.schemas.errors import SettingsError
+from epipole.schemas.given_settings import with_assumptions
+from epipole.schemas.settings import Assumption, Settings
+from epipole.tasks.read.assume_readings import VELOCITIES, as_assumed, as_assumed_source
+
+EXAMPLE = Path(__file__).parents[3] / "examples" / "four_sensor_geo.mcap"
+SENSORS = ("sat1", "sat2", "sat3", "sat4")
+
+
+@pytest.fixture(scope="module")
+def piece():
+    (only,) = read_log_pieces(EXAMPLE)
+    return only
+
+
+def ahead(rows, by_s, sensors):
+    """The rows with later times of some sensors."""
+    of = np.isin(array(rows, "sensor_id"), sensors)
+    time = pa.array(array(rows, "time") + np.where(of, round(by_s * 1e9), 0))
+    index = rows.schema.get_field_index("time")
+    return rows.set_column(index, rows.schema.field("time"), time.cast(rows.schema.types[index]))
+
+
+def later(piece, by_s, *sensors):
+    tables = (ahead(getattr(piece, n), by_s, sensors) for n in ("exposures", "states", "cameras"))
+    moved = (None if t is None else t + round(by_s * 1e9) for t in piece.source[-2:])
+    ends = dict(zip(piece.source._fields[-2:], moved, strict=True))
+    return piece._replace(
+        **dict(zip(("exposures", "states", "cameras"), tables, strict=True)),
+        source=piece.source._replace(**ends),
+    )
+
+
+@pytest.mark.parametrize(
+    ("by_s", "assumed"),
+    [
+        (18.0, {"time": "gps"}),
+        (37.0, {"time": "tai"}),
+        (3618.0, {"time": "gps", "ahead_s": 3600.0}),
+        (-0.5, {"ahead_s": -0.5}),
+    ],
+)
+def test_times_of_all_sensors_are_taken_back(piece, by_s, assumed):
+    wrong, assumptions = later(piece, by_s, *SENSORS), [Assumption(**assumed)]
+    source = as_assumed_source(wrong.source, SENSORS, assumptions)
+    assert as_assumed(wrong, assumptions)._replace(source=source) == piece
+
+
+def test_times_of_one_sensor_are_taken_back_and_no_frame_is_outside_the_log(piece):
+    wrong = later(piece, 18.0, "sat2")
+    gps = [Assumption(sensor="sat2", time="gps")]
+    found = as_assumed(wrong, gps)
+    assert (found.exposures, found.states) == (piece.exposures, piece.states)
+    time_ns = array(found.exposures, "time")
+    source = as_assumed_source(wrong.source, SENSORS, gps)
+    assert source.first_time_ns <= time_ns.min() <= time_ns.max() <= source.last_time_ns
+
+
+def test_frames_of_reference_and_velocities_are_those_assumed(piece):
+    assumed = [
+        Assumption(sensor="sat1", states="TEME"), Assumption(sensor="sat1", velocities="unknown"),
+    ]  # fmt: skip
+    states = as_assumed(piece, assumed).states
+    mine = array(states, "sensor_id") == "sat1"
+    assert set(array(states, "frame")[mine]) == {"TEME"}
+    for name in VELOCITIES:
+        assert np.isnan(states[name].to_numpy()[mine]).all()
+        np.testing.assert_array_equal(
+            states[name].to_numpy()[~mine], piece.states[name].to_numpy()[~mine]
+        )
+    assert states.filter(pa.array(~mine)) == piece.states.filter(pa.array(~mine))
+
+
+def test_what_nobody_assumes_stays(piece):
+    assert as_assumed(piece, [Assumption(sensor="sat9", time="gps", states="ITRF")]) == piece
+    assert as_assumed(piece, ()) is piece
+    gps = [Assumption(sensor="sat9", time="gps")]
+    assert as_assumed_source(piece.source, SENSORS, gps) == piece.source
+
+
+def test_assumptions_of_a_command_join_those_of_the_settings():
+    written = with_assumptions(Settings(), ["*.time=gps"])
+    both = with_assumptions(written, ["sat1.states=TEME", "sat1.ahead_s=0.5"])
+    assert both.sensors.assume == (
+        Assumption(time="gps"), Assumption(sensor="sat1", states="TEME", ahead_s=0.5),
+    )  # fmt: skip
+    assert both.key() != written.key()
+
+
+@pytest.mark.parametrize(
+    ("text", "says"),
+    [
+        ("sat1=gps", "not SENSOR.NAME=VALUE"),
+        ("sat1.time", "not SENSOR.NAME=VALUE"),
+        ("sat1.time=ut1", "assume.0.time = 'ut1'"),
+        ("sat1.scale=gps", "sensors.assume.0.scale"),
+    ],
+)
+def test_an_assumption_that_means_nothing_is_refused(text, says):
+    with pytest.raises(SettingsError, match=says):
+        with_assumptions(Settings(), [text])
