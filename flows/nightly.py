@@ -173,7 +173,7 @@ def recorded(order: Order, night: str | None, asked: bool = True) -> Summary:
             if is_new and (is_empty or not asked):
                 tell(order.out, night, f"{state.value}: {line}")
         raise
-    records = read_records(order.out) if summary.unchanged else {}
+    records = read_records(order.out, summary.nights) if summary.unchanged else {}
     for date in summary.nights:
         if date in records and records[date]["state"] == RunState.MADE:
             continue

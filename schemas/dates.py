@@ -7,6 +7,7 @@ import re
 FIRST_YEAR, LAST_YEAR = 1678, 2261
 YESTERDAY = "yesterday"  # the day before a run is due
 LAST_NIGHTS = 3  # that are made with it: the log of one of them may come late
+MONTH = 30  # nights that say what is usual: which sensors there are, which logs are broken
 _DATE = re.compile(r"\d{4}-\d\d-\d\d", re.ASCII)
 
 

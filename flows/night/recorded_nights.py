@@ -35,7 +35,7 @@ from epipole.io.datasets.table_pieces import MAX_BYTES, within_bounds
 from epipole.io.logs.logged_times import open_mcap, read_digest
 from epipole.io.work.recipe import Recipe, digest_of, logs_key, recipe_of
 from epipole.schemas.bridge import array, concat, from_polars, rows_with, table, to_polars
-from epipole.schemas.dates import nights_before
+from epipole.schemas.dates import MONTH, nights_before
 from epipole.schemas.errors import DatasetError, LogError
 from epipole.schemas.rejects import Reason
 from epipole.schemas.settings import Settings
@@ -91,7 +91,6 @@ def key_of(row: dict[str, Any] | None) -> str:
 LOGGER = logging.getLogger(__name__)
 
 HOUR_NS = 3_600_000_000_000
-MONTH = 30  # days
 
 T = TypeVar("T")
 

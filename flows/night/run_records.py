@@ -9,7 +9,7 @@ import platform
 import resource
 import socket
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
 from importlib import metadata
 from typing import Any, NamedTuple
@@ -19,9 +19,10 @@ import pyarrow.parquet as pq
 
 from epipole.flows.night.summary import Summary
 from epipole.io.datasets.dataset import nights_in, read_beside, read_table, write_beside
+from epipole.io.datasets.local import RUNS as RUNS_FOLDER
 from epipole.io.work.recipe import LIBRARIES
 from epipole.schemas.bridge import table
-from epipole.schemas.dates import nights_before
+from epipole.schemas.dates import MONTH, nights_before
 from epipole.schemas.errors import DatasetError
 from epipole.schemas.rejects import Reason
 from epipole.schemas.run_record import RUNS, RunState
@@ -29,9 +30,7 @@ from epipole.schemas.settings import Settings
 
 LOGGER = logging.getLogger(__name__)
 
-RUNS_FOLDER = "runs"
 METRICS = "last.prom"  # OpenMetrics, of the last run
-MONTH = 30  # days in which a broken log is reported once
 _BROKEN = {
     Reason.NO_MCAP.value: "is no MCAP file; it is on no night",
     Reason.NOTHING_READ.value: "has nothing that can be used; it is on no night",
@@ -50,9 +49,12 @@ class Stopwatch(NamedTuple):
         return cls(time.monotonic(), time.process_time())
 
 
-def read_records(dataset: str) -> dict[str, dict[str, Any]]:
-    """Return the record of each night that has one. Records that cannot be read are left out."""
-    rows = read_beside(dataset, RUNS_FOLDER, RUNS)
+def read_records(dataset: str, nights: Collection[str] | None = None) -> dict[str, dict[str, Any]]:
+    """Return the record of each night that has one, or of some nights.
+
+    Records that cannot be read are left out.
+    """
+    rows = read_beside(dataset, RUNS_FOLDER, RUNS, nights)
     return {row["night"]: row for row in rows}
 
 
@@ -85,7 +87,7 @@ def write_record(
         "settings": settings.changed(),
     }
     try:
-        before = read_records(dataset).get(night)
+        before = read_records(dataset, [night]).get(night)
         file = pa.BufferOutputStream()
         pq.write_table(table(RUNS, {name: [value] for name, value in row.items()}), file)
         write_beside(dataset, RUNS_FOLDER, f"{night}.parquet", file.getvalue().to_pybytes())
@@ -121,7 +123,7 @@ def metrics(row: Mapping[str, Any], counts: Mapping[str, int]) -> str:
 
 def with_looks(summary: Summary) -> Summary:
     """Return the summary of unchanged nights with what needed a look when they were made."""
-    records = read_records(summary.dataset)
+    records = read_records(summary.dataset, summary.nights)
     found = {n: records[n]["needs_look"] for n in summary.nights if n in records}
     return replace(summary, looks=found)
 

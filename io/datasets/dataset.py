@@ -8,7 +8,7 @@ half a night. A run that fails or is killed leaves the dataset unchanged.
 
 import contextlib
 import os
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -204,6 +204,11 @@ def night_location(dataset: Where, night: str) -> Where:
     return night_storage(dataset).location(night)
 
 
+def report_location(dataset: str, night: str) -> str:
+    """Return where the report of a night lies, if there is one."""
+    return f"{dataset.rstrip('/')}/{REPORTS}/{night}.html"
+
+
 def dataset_folder(dataset: Where) -> Path | None:
     """Return the local folder of a dataset. None: it is in an object store."""
     return night_storage(dataset).folder
@@ -237,15 +242,17 @@ def write_beside(dataset: Where, folder: str, name: str, data: bytes) -> None:
             storage.write_beside(folder, name, data)
 
 
-def read_beside(dataset: Where, folder: str, schema: pa.Schema) -> list[dict[str, Any]]:
-    """Return the rows of the Parquet files in a folder beside the nights.
+def read_beside(
+    dataset: Where, folder: str, schema: pa.Schema, nights: Collection[str] | None = None
+) -> list[dict[str, Any]]:
+    """Return the rows of the Parquet files in a folder beside the nights; of all, or of some.
 
     Files that do not have this schema are left out.
     """
     storage = night_storage(dataset)
     rows = []
     with reading(dataset, storage.errors):
-        files = storage.files_beside(folder)
+        files = storage.files_beside(folder, nights)
     for file in files:
         with contextlib.suppress(OSError, ValueError, pa.ArrowException):
             rows += [row for piece in read_pieces(file, schema) for row in piece.to_pylist()]

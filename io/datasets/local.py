@@ -30,7 +30,7 @@ import stat
 import tempfile
 import threading
 import uuid
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import IO, NamedTuple
 
@@ -192,9 +192,10 @@ class LocalNights:
         os.chmod(file.name, 0o666 & ~_umask())
         Path(file.name).replace(target / name)
 
-    def files_beside(self, folder: str) -> list[Path]:
-        """Return the Parquet files in a folder beside the nights, in order."""
-        return sorted((self.folder / folder).absolute().glob("[!.]*.parquet"))
+    def files_beside(self, folder: str, nights: Collection[str] | None = None) -> list[Path]:
+        """Return the Parquet files in a folder beside the nights, in order; of all, or of some."""
+        paths = sorted((self.folder / folder).absolute().glob("[!.]*.parquet"))
+        return [path for path in paths if nights is None or path.stem in nights]
 
     def sizes(self) -> dict[str, int]:
         """Return the bytes of each night, and of each file beside the nights."""

@@ -17,12 +17,12 @@ import contextlib
 import json
 import re
 import threading
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from functools import cache
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import Any
 
 import pyarrow as pa
@@ -272,10 +272,15 @@ class StoreNights:
         """Write one object."""
         self._storage.pipe_file(f"{self._root}/{folder}/{name}", data)
 
-    def files_beside(self, folder: str) -> list[pa.BufferReader]:
-        """Return the Parquet files in a folder beside the nights, in order."""
-        paths = sorted(self._storage.glob(f"{self._root}/{folder}/*.parquet"))
-        return [pa.BufferReader(bytes(self._storage.cat_file(path))) for path in paths]
+    def files_beside(
+        self, folder: str, nights: Collection[str] | None = None
+    ) -> list[pa.BufferReader]:
+        """Return the Parquet files in a folder beside the nights, in order; of all, or of some."""
+        return [
+            pa.BufferReader(bytes(self._storage.cat_file(path)))
+            for path in sorted(self._storage.glob(f"{self._root}/{folder}/*.parquet"))
+            if nights is None or PurePosixPath(path).stem in nights
+        ]
 
     def sizes(self) -> dict[str, int]:
         """Return the bytes of each night, and of each file beside the nights."""

@@ -1,7 +1,7 @@
 """Where a dataset is stored: in a local folder or in an object store, behind one protocol."""
 
 import contextlib
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Protocol
 from urllib.parse import unquote, urlsplit
@@ -48,8 +48,11 @@ class NightStorage(Protocol):
     def write_beside(self, folder: str, name: str, data: bytes) -> None:
         """Write a file into a folder beside the nights, or replace it, at once."""
 
-    def files_beside(self, folder: str) -> Sequence[Any]:
-        """Return the Parquet files in a folder beside the nights, as pyarrow reads them."""
+    def files_beside(self, folder: str, nights: Collection[str] | None = None) -> Sequence[Any]:
+        """Return the Parquet files in a folder beside the nights, as pyarrow reads them.
+
+        Each has the name of a night. None: of all nights.
+        """
 
     def sizes(self) -> dict[str, int]:
         """Return the bytes of each night (``night=DATE``), and of each file beside the nights."""
