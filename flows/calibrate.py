@@ -10,6 +10,7 @@ import pyarrow.compute as pc
 from epipole.flows.night.summary import many
 from epipole.io.caches.private_folders import temporary_folder
 from epipole.io.logs.listing import list_logs
+from epipole.io.logs.messages.cameras import PINHOLE_TERMS
 from epipole.io.logs.writer import distortion_of
 from epipole.io.work.work_layout import ReadFolder
 from epipole.schemas.bridge import concat
@@ -31,8 +32,6 @@ from epipole.tasks.read.order_frames import (
 )
 from epipole.tasks.read.read_logs import read_log_into
 
-# The terms of the distortion, and the powers of the distance by which they move an image position.
-TERMS, POWERS = ("k1", "k2", "p1", "p2", "k3"), (2, 4, 1, 1, 6)
 MOST_CORNER_PX = 1.0  # 1-sigma of a term, at the corner: the stars do not show a larger one
 MAX_FRAMES = 100  # of a sensor, spread over the logs
 
@@ -188,7 +187,7 @@ def _values(report: CameraReport, names: tuple[str, ...]) -> str:
 def _corner_px(report: CameraReport, name: str) -> float:
     """Return by how much 1-sigma of a term of the distortion moves the corner of the image [px]."""
     c = report.camera
-    if c is None or name not in TERMS:
+    if c is None or name not in PINHOLE_TERMS:
         return 0.0
     corner = math.hypot(c.width / 2 / c.fx_px, c.height / 2 / c.fy_px)
-    return float(report.sigma[name] * corner ** (POWERS[TERMS.index(name)] + 1) * abs(c.fx_px))
+    return float(report.sigma[name] * corner ** (PINHOLE_TERMS[name] + 1) * abs(c.fx_px))

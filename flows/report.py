@@ -6,7 +6,7 @@ from pathlib import Path
 from urllib.parse import quote
 
 from epipole.flows.night.reports import night_facts
-from epipole.io.datasets.dataset import night_row, nights_in
+from epipole.io.datasets.dataset import night_row, nights_in, report_location
 from epipole.io.paths import fault_of_name, file_system, storage_errors
 from epipole.schemas.errors import DatasetError, ReportError
 
@@ -50,7 +50,7 @@ def _calendar(dataset: str, nights: list[str], out: Path) -> str:
             row = night_row(dataset, night)
         except DatasetError:
             row = None
-        page = f"{dataset.rstrip('/')}/reports/{night}.html"
+        page = report_location(dataset, night)
         said = VERDICT.search(_head_of(page))
         address = _address(page, out) if said else ""
         found.append(CalendarNight(night, row, said[1] if said else "", address))

@@ -31,7 +31,7 @@ from prefect.states import Completed, Failed
 
 from epipole.flows.night.progress import COMPILE, ROOT, STEPS, with_safe_text
 from epipole.flows.night.summary import Summary, many
-from epipole.io.datasets.local import REPORTS
+from epipole.io.datasets.dataset import report_location
 from epipole.schemas.errors import EpipoleError, NoFramesError
 from epipole.schemas.rejects import Reason
 from epipole.schemas.text import as_line, as_markdown_text
@@ -177,12 +177,7 @@ def _table_paths(summary: Summary) -> list[str]:
 
 def report_paths(summary: Summary) -> list[str]:
     """Return where the reports of the nights lie, which have extracts."""
-    return [report_path(summary.dataset, extract.night) for extract in summary.extracts]
-
-
-def report_path(dataset: str, night: str) -> str:
-    """Return where the report of a night lies, if there is one."""
-    return f"{dataset.rstrip('/')}/{REPORTS}/{night}.html"
+    return [report_location(summary.dataset, extract.night) for extract in summary.extracts]
 
 
 def _table(heading: str, counts: dict[str, int]) -> list[str]:
@@ -241,7 +236,7 @@ def tell(dataset: str, night: str, message: str) -> None:
                 "prefect.resource.name": f"night {night}",
                 "epipole.dataset": dataset,
                 "epipole.message": message,
-                "epipole.report": report_path(dataset, night),
+                "epipole.report": report_location(dataset, night),
             },
         )
 
