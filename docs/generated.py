@@ -35,6 +35,7 @@ from epipole.schemas.rejects import (
     Outcome,
     Reason,
 )
+from epipole.schemas.run_record import RUNS, RunState
 from epipole.schemas.scene import (
     LensDeparture,
     Orbit,
@@ -102,23 +103,34 @@ def columns() -> str:
     return "\n".join(_section(name, schema) for name, schema in TABLES.items())
 
 
+_HEADING = ("column", "type", "unit", "frame", "null", "meaning")
+
+
 def _section(name: str, schema: pa.Schema) -> str:
-    heading = ("column", "type", "unit", "frame", "null", "meaning")
     rows = [_column(field) for field in schema]
-    return f"### {name}\n\n{_doc(schema)}\n\n{_markdown(heading, rows)}"
+    return f"### {name}\n\n{_doc(schema)}\n\n{_markdown(_HEADING, rows)}"
 
 
 def _column(field: pa.Field) -> tuple[str, ...]:
     about = {key.decode(): value.decode() for key, value in (field.metadata or {}).items()}
     kind = str(field.type).replace("double", "float64").replace(", tz=UTC", ", UTC")
     null = "yes" if field.nullable else ""
+    before = f" Nights made before it was there: `{about['before']}`." if "before" in about else ""
     return (
-        f"`{field.name}`", kind, about.get("unit", ""), about.get("frame", ""), null, about["doc"]
+        f"`{field.name}`", kind, about.get("unit", ""), about.get("frame", ""), null,
+        about["doc"] + before,
     )  # fmt: skip
 
 
 def _doc(schema: pa.Schema) -> str:
     return schema.metadata[b"doc"].decode()
+
+
+def runs() -> str:
+    """Return the columns of the records of runs, and how a run ends."""
+    rows = [_column(field) for field in RUNS]
+    states = _words("state", RunState)
+    return f"{_doc(RUNS)}\n\n{_markdown(_HEADING, rows)}\n{states}"
 
 
 def reasons() -> str:
@@ -319,6 +331,7 @@ PARTS: dict[str, dict[str, Callable[[], str]]] = {
         "found": found,
         "verdicts": verdicts,
         "checks": checks,
+        "runs": runs,
     },
     "docs/input.md": {"bounds": bounds, "mistakes": mistakes},
     "docs/settings.md": {"settings": settings},

@@ -1,6 +1,8 @@
 """Building blocks of Arrow schemas: a column with its unit, frame and meaning."""
 
+import json
 from collections.abc import Iterable, Sequence
+from typing import Any
 
 import pyarrow as pa
 
@@ -24,18 +26,31 @@ def column(
     unit: str = "",
     frame: str = "",
     null: bool = False,
+    before: bool | float | list[str] | None = None,
 ) -> pa.Field:
     """Return a field with its unit, frame and meaning as metadata.
 
-    With `null` the column may have nulls; `doc` then says what a null means.
+    With `null` the column may have nulls; `doc` then says what a null means. A column that is added
+    without nulls says by `before` what it is in nights that were published before it was there.
     """
-    metadata = {"doc": doc, "unit": unit, "frame": frame}
+    said = "" if before is None else json.dumps(before)
+    metadata = {"doc": doc, "unit": unit, "frame": frame, "before": said}
     return pa.field(
         name,
         kind,
         nullable=null,
         metadata={key: value for key, value in metadata.items() if value},
     )
+
+
+def values_before(schema: pa.Schema) -> dict[str, Any]:
+    """Return the columns that a night published before they were there may lack, and what they are
+    in it; None is null."""
+    said = {field.name: (field.metadata or {}).get(b"before", b"null") for field in schema}
+    values = {name: json.loads(value) for name, value in said.items()}
+    return {
+        n: value for n, value in values.items() if value is not None or schema.field(n).nullable
+    }
 
 
 def time_column(

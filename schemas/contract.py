@@ -1,9 +1,11 @@
 """What programs that read a dataset rely on: columns, keys, and links between tables.
 
 docs/tables.json has it for machines. Nights of all versions stand in one dataset, so what is there
-may gain columns, but not change without another version of the table.
+may gain columns, but not change without another version of the table. A column that is added may be
+null, or says what it is in nights that were published before (`before`): they are read so.
 """
 
+import json
 from collections.abc import Iterator
 from typing import Any, NamedTuple
 
@@ -84,12 +86,14 @@ def _table(name: str, schema: pa.Schema) -> dict[str, Any]:
 
 def _column(field: pa.Field) -> dict[str, Any]:
     about = {key.decode(): value.decode() for key, value in (field.metadata or {}).items()}
+    before = {"before": json.loads(about["before"])} if "before" in about else {}
     return {
         "type": str(field.type),
         "null": field.nullable,
         "unit": about.get("unit", ""),
         "frame": about.get("frame", ""),
         "meaning": about["doc"],
+        **before,
     }
 
 
@@ -113,6 +117,9 @@ def breaks(before: dict[str, Any], after: dict[str, Any]) -> Iterator[str]:
                 yield f"{name}: {what} was {column[what] or 'none'}, is {now[what] or 'none'}"
         if now["null"] and not column["null"]:
             yield f"{name}: may be null, which it was not"
+    for name, column in after["columns"].items():
+        if name not in before["columns"] and not column["null"] and "before" not in column:
+            yield f"{name}: is new, may not be null, and does not say what it is in earlier nights"
     if before["key"] != after["key"]:
         yield f"key: was {', '.join(before['key'])}, is {', '.join(after['key'])}"
     for link in before["links"]:

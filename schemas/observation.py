@@ -34,6 +34,7 @@ SIGHTED_FIELDS = [
     column(
         "blended",
         pa.bool_(),
+        before=False,
         doc="Whether it may hold the light of a second object of the same sensor. Both sigmas of "
         "the direction have that error; the magnitude's has not.",
     ),

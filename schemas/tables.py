@@ -269,6 +269,7 @@ POSITIONS = schema(
         column(
             "independent",
             pa.bool_(),
+            before=False,
             doc="A position is fitted to the detections of some seconds before and after the "
             "epoch (`alignment.window_s`, 6 s unless set), so neighbouring rows of an object share "
             "detections: their errors correlate by 0.95 after 1 s, by half after 5 s, and not at "
@@ -419,10 +420,11 @@ CALIBRATIONS = schema(
             column(f"sigma_{name}", F64, unit=unit, doc=f"1-sigma of {name}.")
             for name, unit, _ in _OPTICS
         ],
-        column("k4", F64, doc="Of the eighth power; as the log states it."),
+        column("k4", F64, before=0.0, doc="Of the eighth power; as the log states it."),
         column(
             "fisheye",
             pa.bool_(),
+            before=False,
             doc="Without distortion, the distance from the principal point is the angle from the "
             "boresight times the focal length (ROS's equidistant).",
         ),
@@ -540,7 +542,7 @@ NIGHTS = schema(
         ),
         column("earlier_key", pa.string(), doc="Digest of these keys of the nights before."),
         *[column(name, I64, doc=doc) for name, doc in _COUNTS],
-        column("sensor_ids", TEXTS, doc="The star sensors that have frames."),
+        column("sensor_ids", TEXTS, before=[], doc="The star sensors that have frames."),
         column("faults", TEXTS, doc="Sensors at fault, a sentence each."),
         column(
             "residuals",

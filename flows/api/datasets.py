@@ -9,6 +9,7 @@ import pyarrow as pa
 from epipole.io.datasets.dataset import check_folder, dataset_folder, nights_in, read_table
 from epipole.io.paths import known_as
 from epipole.schemas.bridge import empty
+from epipole.schemas.columns import values_before
 from epipole.schemas.errors import DatasetError
 from epipole.schemas.tables import TABLES
 
@@ -17,8 +18,8 @@ class Dataset(Mapping[str, pl.LazyFrame]):
     """The tables of a dataset by their names, all nights together.
 
     Each table is a polars `LazyFrame` with the column `night` (a date) in addition. A filter on
-    `night` reads the files of these nights only. A column that was not yet made when a night was
-    published is null there.
+    `night` reads the files of these nights only. A column that was added since a night was
+    published is null there, or as the page of tables says.
 
     Attributes
     ----------
@@ -40,12 +41,19 @@ class Dataset(Mapping[str, pl.LazyFrame]):
         rows: pa.Table = empty(TABLES[name])
         if not parts:
             return pl.LazyFrame(rows).with_columns(night=pl.lit(None, pl.Date))
-        return pl.scan_parquet(
+        types = pl.DataFrame(rows).schema
+        found = pl.scan_parquet(
             parts,
-            schema=pl.DataFrame(rows).schema,
+            schema=types,
             hive_schema={"night": pl.Date},
             hive_partitioning=True,
             missing_columns="insert",
+            extra_columns="ignore",
+        )
+        added = {k: value for k, value in values_before(rows.schema).items() if value is not None}
+        return found.with_columns(
+            pl.col(column).fill_null(pl.lit(value, types[column]))
+            for column, value in added.items()
         )
 
     def _of_night(self, name: str, night: str) -> pl.LazyFrame:

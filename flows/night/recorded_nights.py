@@ -139,8 +139,10 @@ class EarlierNights:
         """Return the sensors that at least half of the nights in the month before a night have."""
         dates = {*nights_in(self.dataset), *self.staged}.intersection(nights_before(night, MONTH))
         before = [row for date in sorted(dates) if (row := self._row(date)) is not None]
-        nights = Counter(name for row in before for name in row["sensor_ids"])
-        return sorted(name for name, count in nights.items() if 2 * count >= len(before))
+        # A night of before they were recorded has sensors, but no names of them.
+        named = [row["sensor_ids"] for row in before if row["sensor_ids"] or not row["sensors"]]
+        nights = Counter(name for names in named for name in names)
+        return sorted(name for name, count in nights.items() if 2 * count >= len(named))
 
     def key(self, night: str, settings: Settings) -> str:
         """Return a digest of what the nights were made from that the other methods read."""

@@ -19,7 +19,7 @@ from epipole.io.datasets.local import REPORTS, RUNS
 from epipole.io.datasets.lock_record import STAGING
 from epipole.io.datasets.night_tables import NightReader
 from epipole.io.datasets.storage import NightStorage, Where, night_storage, reading
-from epipole.io.datasets.table_pieces import Between, read_pieces
+from epipole.io.datasets.table_pieces import Between, read_pieces, unreadable
 from epipole.io.paths import fault_of_name, line_of
 from epipole.schemas.bridge import conform
 from epipole.schemas.errors import DatasetError
@@ -111,6 +111,8 @@ def read_table(
 ) -> pa.Table:
     """Return a table of a night. It has no rows where the night is missing.
 
+    Columns that were added since the night was published are null, or what their declaration says.
+
     Parameters
     ----------
     columns
@@ -161,10 +163,7 @@ def table_pieces(
             for rows in read_pieces(part, wanted, time, between_ns or (None, None)):
                 yield conform(schema, rows)
     except (OSError, ValueError, pa.ArrowException) as error:
-        raise DatasetError(
-            f"{dataset}/night={night}/{table}: cannot be read ({line_of(error)}); "
-            "remove the folder of the night and run the night again"
-        ) from error
+        raise unreadable(f"{dataset}/night={night}/{table}", error) from error
 
 
 def _schema(table: str, columns: Sequence[str]) -> pa.Schema:

@@ -15,8 +15,13 @@ import polars as pl
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from epipole.io.datasets.table_pieces import MAX_BYTES, read_pieces, within_bounds
-from epipole.io.paths import file_system, line_of, storage_errors
+from epipole.io.datasets.table_pieces import (
+    MAX_BYTES,
+    read_pieces,
+    unreadable,
+    within_bounds,
+)
+from epipole.io.paths import file_system, storage_errors
 from epipole.schemas.bridge import conform, to_polars
 from epipole.schemas.errors import DatasetError
 from epipole.schemas.tables import TABLES
@@ -104,12 +109,9 @@ class NightReader:
         except DatasetError:
             raise
         except (KeyError, pa.ArrowException, pl.exceptions.PolarsError) as error:
-            raise self._unreadable(table, error) from error
+            raise unreadable(f"{self.where}/{table}", error) from error
         except storage_errors() as error:
-            raise self._unreadable(table, error) from error
-
-    def _unreadable(self, table: str, error: Exception) -> DatasetError:
-        return DatasetError(f"{self.where}/{table}: cannot be read ({line_of(error)})")
+            raise unreadable(f"{self.where}/{table}", error) from error
 
 
 def _rows(file: pq.ParquetFile, group: int) -> int:

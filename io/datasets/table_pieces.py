@@ -1,18 +1,24 @@
 """Parquet files of a dataset, read in pieces of bounded size and checked against their schema.
 
-Another program may have written them. A few kilobytes can hold millions of equal rows, or one long
-text millions of times, so neither a file's size nor its number of rows says how much it unpacks to.
+A night that was published before a column was there has it as its declaration says: null, or what
+it is in such nights.
+
+Another program may have written the files. A few kilobytes can hold millions of equal rows, or one
+long text millions of times, so neither a file's size nor its number of rows says how much it
+unpacks to.
 """
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Collection, Iterable, Iterator
 from typing import Any
 
 import pyarrow as pa
 import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
+from epipole.io.paths import line_of
 from epipole.schemas.bridge import conform
-from epipole.schemas.columns import TIME
+from epipole.schemas.columns import TIME, values_before
+from epipole.schemas.errors import DatasetError
 
 ROWS_IN_PIECE = 1 << 17
 # Of the texts of a piece, and of all rows that are kept of a table of an earlier night. Half an
@@ -33,7 +39,7 @@ def read_pieces(
     file
         A path, or an open file.
     schema
-        Only its columns are read.
+        Only its columns are read. One that the file does not have is null, or as declared.
     time
         A column by which rows are chosen; row groups of other times are not read.
 
@@ -43,18 +49,70 @@ def read_pieces(
         Where the file is damaged, does not have this schema, or a piece is too large.
     """
     metadata = pq.read_metadata(file)
-    present = [name for name in schema.names if name in metadata.schema.to_arrow_schema().names]
+    stored = metadata.schema.to_arrow_schema()
+    present = [name for name in schema.names if name in stored.names]
+    added = _added(schema, present)
+    for name in present:
+        _check_type(stored.field(name), schema.field(name))
     texts = [name for name in present if schema.field(name).type == pa.string()]
     parquet = pq.ParquetFile(file, metadata=metadata, read_dictionary=texts)
     groups = _groups(parquet, time, between_ns)
     _check_lists(parquet, groups, [f.name for f in schema if pa.types.is_list(f.type)])
-    if len(present) < len(schema):
-        conform(schema, parquet.schema_arrow.empty_table())  # names those that are missing
     for batch in parquet.iter_batches(ROWS_IN_PIECE, groups, columns=present) if groups else ():
         _check_texts(batch)
-        rows = conform(schema, pa.Table.from_batches([batch]))
+        rows = conform(schema, _completed(schema, batch, added))
         rows.validate(full=True)  # invalid UTF-8 would end in an error where it is shown
         yield rows if time is None else rows.filter(_chosen(rows[time], between_ns))
+
+
+def _added(schema: pa.Schema, present: Collection[str]) -> dict[str, pa.Scalar]:
+    """Return the columns that a file does not have, and what they are in it."""
+    lacking = [field for field in schema if field.name not in present]
+    values = values_before(schema)
+    if gone := [field.name for field in lacking if field.name not in values]:
+        raise ValueError(f"it has no column {', '.join(gone)}")
+    return {field.name: pa.scalar(values[field.name], field.type) for field in lacking}
+
+
+def _completed(schema: pa.Schema, batch: pa.RecordBatch, added: dict[str, pa.Scalar]) -> pa.Table:
+    """Return the rows with the columns of this schema that were added since."""
+    given = dict(zip(batch.schema.names, batch.columns, strict=True))
+    more = {name: pa.repeat(value, batch.num_rows) for name, value in added.items()}
+    return pa.table({name: (given | more)[name] for name in schema.names})
+
+
+_KINDS = {
+    "text": (pa.types.is_string, pa.types.is_large_string, pa.types.is_string_view),
+    "times": (pa.types.is_timestamp,),
+    "whole numbers": (pa.types.is_integer,),
+    "numbers": (pa.types.is_floating,),
+    "yes or no": (pa.types.is_boolean,),
+    "lists": (pa.types.is_list, pa.types.is_large_list),
+}
+
+
+def _check_type(stored: pa.Field, field: pa.Field) -> None:
+    """Raise where a column holds another kind of values; their width may differ."""
+    found, wanted = _kind(stored.type), _kind(field.type)
+    if found != wanted:
+        raise ValueError(f"its column {field.name} has {found}, not {wanted}")
+
+
+def _kind(values: pa.DataType) -> str:
+    if pa.types.is_dictionary(values):
+        values = values.value_type
+    return next(
+        (kind for kind, tests in _KINDS.items() if any(test(values) for test in tests)),
+        f"values of type {values}",
+    )
+
+
+def unreadable(where: str, error: Exception) -> DatasetError:
+    """Return the error of a table that cannot be read, which says what to do."""
+    return DatasetError(
+        f"{where}: cannot be read ({line_of(error)}); "
+        "remove the folder of the night and run the night again"
+    )
 
 
 def within_bounds(pieces: Iterable[pa.Table], max_bytes: int) -> Iterator[pa.Table]:

@@ -7,6 +7,7 @@ from pathlib import Path
 import polars as pl
 import pytest
 
+from epipole.schemas.columns import values_before
 from epipole.schemas.contract import KEYS, breaks, contract
 from epipole.schemas.tables import TABLES
 
@@ -26,8 +27,8 @@ def test_the_page_for_machines_is_up_to_date():
     assert contract() == SAID, "`.ci/generate pages` writes docs/tables.json again"
 
 
-def renamed(table):
-    table["columns"]["x"] = table["columns"].pop("x_km")
+def without_it(table):
+    del table["columns"]["x_km"]
     return "x_km: the column is gone"
 
 
@@ -56,7 +57,7 @@ def no_link(table):
     return "link: object_id does not lead to objects any more"
 
 
-@pytest.mark.parametrize("change", [renamed, other_unit, other_type, null, other_key, no_link])
+@pytest.mark.parametrize("change", [without_it, other_unit, other_type, null, other_key, no_link])
 def test_a_change_that_breaks_readers_is_told_by_name(change):
     before = contract()["positions"]
     after = copy.deepcopy(before)
@@ -65,11 +66,22 @@ def test_a_change_that_breaks_readers_is_told_by_name(change):
     assert list(breaks(before, after | {"version": "2"})) == []
 
 
-def test_a_new_column_breaks_nobody():
+@pytest.mark.parametrize("more", [{"null": True}, {"before": 0.0}])
+def test_a_new_column_breaks_nobody(more):
+    before = contract()["positions"]
+    after = copy.deepcopy(before)
+    after["columns"]["worst_sigma"] = after["columns"]["chi2"] | more
+    assert list(breaks(before, after)) == []
+
+
+def test_a_new_column_without_nulls_says_what_it_is_in_earlier_nights():
     before = contract()["positions"]
     after = copy.deepcopy(before)
     after["columns"]["worst_sigma"] = after["columns"]["chi2"]
-    assert list(breaks(before, after)) == []
+    (told,) = breaks(before, after)
+    assert told.startswith("worst_sigma: is new, may not be null")
+    assert values_before(TABLES["calibrations"]) == {"k4": 0.0, "fisheye": False}
+    assert values_before(TABLES["nights"]) == {"sensor_ids": [], "known_key": None}
 
 
 def test_each_column_of_a_key_exists():
