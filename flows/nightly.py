@@ -207,8 +207,8 @@ def make_nights(order: Order, night: str | None) -> Summary:
             for date in chosen:
                 if len(chosen) > 1:
                     LOGGER.info("night %s", date)
-                gave = gave_something(frames.sources, frames.rejects, date)
-                recipe = recipe_of(night_logs_key(given, date, *gave), settings, known_key)
+                made = gave_something(frames.sources, frames.rejects, date)
+                recipe = recipe_of(night_logs_key(given, date, made), settings, known_key)
                 work = work_folder(work_root(out), date, recipe.work_key(date))
                 folder = WorkFolder(kept.enter_context(work))
                 rejects = into_nights(

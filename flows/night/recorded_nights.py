@@ -261,7 +261,7 @@ def published_night(
     stale = [
         text for name, text in _DIFFERS.items() if getattr(made_with, name) != getattr(today, name)
     ]
-    if given and made and night_logs_key(given, date, *made) != row["logs_key"]:
+    if given and made and night_logs_key(given, date, made) != row["logs_key"]:
         stale.append("other logs")
     earlier = earlier or EarlierNights(dataset, {})
     if row["earlier_key"] != earlier.key(date, settings):
@@ -274,36 +274,33 @@ def published_night(
 HASHED_AT_ONCE = 2  # logs
 
 
-def night_logs_key(
-    given: FoundLogs, night: str, also: Collection[str], but: Collection[tuple[str, int]],
-    whole: Mapping[str, str] = MappingProxyType({}),
-) -> str:  # fmt: skip
+class MadeFrom(NamedTuple):
+    """Which logs gave a night something.
+
+    names : of those that did
+    empty : names and sizes of those that gave nothing
+    digests : by their names, of those that are known
+    """
+
+    names: set[str]
+    empty: set[tuple[str, int]]
+    digests: Mapping[str, str] = MappingProxyType({})
+
+
+def night_logs_key(given: FoundLogs, night: str, made: MadeFrom) -> str:
     """Return the `logs_key` of a night: of its logs, as far as the night may depend on their bytes.
 
-    Parameters
-    ----------
-    also, but
-        Names of logs that gave something to the night; names and sizes of those that gave nothing.
-    whole
-        Digests of logs by their names, of those that are known.
+    `made` is what it was made from, and `given` are all logs of the run.
     """
     until_ns = end_ns(night)
-    paths = _logs_of(given, night, also, but)
+    paths = _logs_of(given, night, made)
     with ThreadPoolExecutor(HASHED_AT_ONCE, "hash logs") as pool:
-        known = [whole.get(name_of(path)) for path in paths]
+        known = [made.digests.get(name_of(path)) for path in paths]
         digests = list(pool.map(read_digest, paths, [until_ns] * len(paths), known))
     return logs_key(zip(map(name_of, paths), digests, strict=True))
 
 
-class Given(NamedTuple):
-    """What logs gave to a night; arguments of `night_logs_key`."""
-
-    also: set[str]
-    but: set[tuple[str, int]]
-    whole: dict[str, str]
-
-
-def gave_something(sources: Sequence[LogSource], rejects: pa.Table, night: str) -> Given:
+def gave_something(sources: Sequence[LogSource], rejects: pa.Table, night: str) -> MadeFrom:
     """Return which logs gave something to a night, and which nothing at all.
 
     `sources` are those that gave something to any night, `rejects` what reading left out.
@@ -316,7 +313,7 @@ def gave_something(sources: Sequence[LogSource], rejects: pa.Table, night: str) 
     }
     names = Counter(log.name for log in sources)
     whole = {log.name: log.sha256 for log in sources if names[log.name] == 1}
-    return Given(of_night, _empty(rejects), whole)
+    return MadeFrom(of_night, _empty(rejects), whole)
 
 
 def _empty(rejects: pa.Table) -> set[tuple[str, int]]:
@@ -325,14 +322,12 @@ def _empty(rejects: pa.Table) -> set[tuple[str, int]]:
     return {(row["source"], row["offset"]) for row in rows}
 
 
-def _logs_of(
-    given: FoundLogs, night: str, also: Collection[str], but: Collection[tuple[str, int]]
-) -> list[str]:
+def _logs_of(given: FoundLogs, night: str, made: MadeFrom) -> list[str]:
     may = set(given.of(night))
     return [
         path
         for path in given.paths
-        if (path in may or name_of(path) in also) and not _is_among(path, but)
+        if (path in may or name_of(path) in made.names) and not _is_among(path, made.empty)
     ]
 
 
@@ -374,8 +369,8 @@ def unchanged_nights(
         logs = {date: made for date in made_so if (made := made_from(dataset, date, given))}
         same = [
             date
-            for date, (names, empty) in logs.items()
-            if night_logs_key(given, date, names, empty) == made_so[date]["logs_key"]
+            for date, made in logs.items()
+            if night_logs_key(given, date, made) == made_so[date]["logs_key"]
         ]
         if not same or not (night or _all_nights(dataset, given, {d: logs[d] for d in same})):
             return []
@@ -397,13 +392,6 @@ def _rows(dataset: str, night: str | None) -> dict[str, dict[str, Any]]:
     return {date: row for date, row in rows.items() if row is not None}
 
 
-class MadeFrom(NamedTuple):
-    """The names of logs that gave a night something; names and sizes of those that gave nothing."""
-
-    names: set[str]
-    empty: set[tuple[str, int]]
-
-
 def made_from(dataset: str, night: str, given: FoundLogs) -> MadeFrom | None:
     """Return which logs a night was made from; None where they are not among those given.
 
@@ -420,9 +408,9 @@ def _all_nights(dataset: str, given: FoundLogs, same: Mapping[str, MadeFrom]) ->
     """Return whether no other night can have frames of the logs of these."""
     known = {
         path
-        for date, (names, empty) in same.items()
+        for date, made in same.items()
         for path in given.paths
-        if _is_among(path, empty) or path in _logs_of(given, date, names, empty)
+        if _is_among(path, made.empty) or path in _logs_of(given, date, made)
     }
     dates: set[str] = set()
     for date in same:

@@ -1,0 +1,22 @@
+"""What `epipole calibrate` prints of a fitted camera."""
+
+import pytest
+
+from epipole.flows.calibrate import lines
+from epipole.tasks.algorithms.geometry.camera import Camera
+from epipole.tasks.calibrate.calibrate_unknown import CameraReport
+
+TERMS = ("fx_px", "fy_px", "cx_px", "cy_px", "k1", "k2", "p1", "p2")
+CAMERA = Camera(1024, 1024, 2000.0, 2000.0, 511.5, 511.5, k3=0.1)
+
+
+@pytest.mark.parametrize(
+    # At the corner, 0.362 focal lengths off, the term moves the image by 0.8 of these pixels.
+    ("sigma_k3", "says"),
+    [(0.5, "k3 0.10000 +- 0.50000"), (2.0, "k3 not known")],
+)
+def test_a_term_that_the_stars_do_not_show_is_not_printed(sigma_k3, says):
+    sigma = dict.fromkeys(TERMS, 1e-3) | {"k3": sigma_k3}
+    report = CameraReport("a", CAMERA, 1.1, True, True, CAMERA, sigma, 3, 3, 90, 0.1)
+    (line,) = (line for line in lines(report) if line.startswith("  distortion"))
+    assert line.endswith(f"p1 0.00000 +- 0.00100, p2 0.00000 +- 0.00100, {says}")
