@@ -11,7 +11,6 @@ Array = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int64]
 
 PAIR_BINS = np.linspace(0.0, 5.0, 26)  # edges, in sigmas
-MAX_FREEDOM = 4000  # degrees of freedom with a bin each
 MIN_BINS, MAX_BINS = 8, 40
 FEW = 60  # values: fewer make no bars that one could compare with a line
 
@@ -71,12 +70,13 @@ def _pairs(night: NightReader) -> Chi2 | None:
 
 
 def _positions(night: NightReader) -> Chi2 | None:
-    freedom = np.zeros(MAX_FREEDOM + 1, np.int64)
+    freedom = np.zeros(1, np.int64)
     total, independent = 0.0, 0
     columns = ["n_sensors", "chi2", "independent"]
     for rows in night.pieces("positions", columns):
-        dof = np.clip(2 * rows["n_sensors"].to_numpy() - 3, 1, MAX_FREEDOM)
-        freedom += np.bincount(dof, minlength=len(freedom))
+        dof = np.maximum(2 * rows["n_sensors"].to_numpy() - 3, 1)
+        more = np.bincount(dof, minlength=len(freedom))
+        freedom = more + np.pad(freedom, (0, len(more) - len(freedom)))
         total += float(rows["chi2"].sum())
         independent += int(rows["independent"].sum())
     if not freedom.sum():
@@ -95,8 +95,7 @@ def _states(night: NightReader) -> Chi2 | None:
     rows = night.read("states", ["chi2", "dof"])
     if not len(rows):
         return None
-    dof = np.clip(rows["dof"].to_numpy(), 1, MAX_FREEDOM)
-    freedom = np.bincount(dof, minlength=MAX_FREEDOM + 1)
+    freedom = np.bincount(np.maximum(rows["dof"].to_numpy(), 1))
     edges = _edges(freedom)
     chi2 = rows["chi2"].to_numpy()
     counts = np.histogram(np.minimum(chi2, edges[-1]), edges)[0]
@@ -115,5 +114,4 @@ def _chi2(
     edges: Array, counts: Indices, freedom: Indices, total: float, independent: int, few: Array
 ) -> Chi2:
     freedoms = int(freedom @ np.arange(len(freedom)))
-    by_number = np.trim_zeros(freedom, "b")
-    return Chi2(edges, counts, by_number, total, freedoms, independent, np.sort(few))
+    return Chi2(edges, counts, freedom, total, freedoms, independent, np.sort(few))

@@ -1,16 +1,24 @@
 """Random skies and frames for the tests of star identification."""
 
+from functools import cache
+
 import numpy as np
 
 from epipole.tasks.algorithms.geometry.camera import Camera, inside, pixel_angle, project, unproject
 from epipole.tasks.algorithms.geometry.directions import canonical, matrix_from_quaternion
-from epipole.tasks.algorithms.star_catalogue import NavigationCatalogue
+from epipole.tasks.algorithms.star_catalogue import NavigationCatalogue, limit_for_density
 from epipole.tasks.algorithms.star_identification.centroids import RawCentroids, SensorCentroids
 from epipole.tasks.algorithms.star_identification.frame import (
     FieldOfView,
     FrameCentroids,
     MatchSettings,
     aberrate_all,
+)
+from epipole.tasks.algorithms.star_identification.star_grid import (
+    pattern_pairs,
+    pattern_size,
+    sky_grid,
+    sky_to_limit,
 )
 
 CAMERA = Camera(1024, 1024, 3660.0, 3660.0, 511.5, 511.5)  # 16 degrees
@@ -85,3 +93,34 @@ def join_centroids(frames, sigma_px, pixel_rad):
 def angle_between(R, S):
     """Return the angle of the rotation between two attitudes [rad]."""
     return 2 * np.arcsin(np.linalg.norm(R - S) / np.sqrt(8))
+
+
+LARGE_CATALOGUE = random_catalogue(15_000)
+SEEN = sky_to_limit(LARGE_CATALOGUE, 5.75).catalogue
+
+
+class Skies:
+    """Skies of the large catalogue."""
+
+    def limit_for(self, stars_per_sr):
+        return limit_for_density(LARGE_CATALOGUE.magnitude, stars_per_sr)
+
+    @cache  # noqa: B019 - lives as long as the tests
+    def sky(self, limit):
+        return sky_to_limit(LARGE_CATALOGUE, limit)
+
+    @cache  # noqa: B019
+    def grid(self, limit, radius_rad):
+        return sky_grid(self.sky(limit), radius_rad)
+
+    def pairs(self, limit, optics):
+        n = pattern_size(self.sky(limit), optics.solid_angle_sr)
+        return _pairs(n, 2 * optics.half_diagonal_rad)
+
+
+@cache
+def _pairs(n, diagonal_rad):
+    return pattern_pairs(LARGE_CATALOGUE.u_icrs[:n], diagonal_rad)
+
+
+SKIES = Skies()

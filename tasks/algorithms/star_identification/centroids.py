@@ -76,6 +76,14 @@ class RawCentroids(NamedTuple):
         n = self.counts[frames]
         first = np.concatenate([[0], np.cumsum(n)])
         at = np.arange(first[-1]) + np.repeat(self.first[frames] - first[:-1], n)
+        return self._rows(first, at, frames)
+
+    def parts(self, parts: Sequence[Rows], frames: Rows) -> "RawCentroids":
+        """Return parts of frames (rows of centroids) as frames."""
+        first = np.concatenate([[0], np.cumsum([len(part) for part in parts])]).astype(np.int64)
+        return self._rows(first, np.concatenate([np.zeros(0, np.int64), *parts]), frames)
+
+    def _rows(self, first: Rows, at: Rows, frames: Rows) -> "RawCentroids":
         return RawCentroids(
             first, self.u[at], self.pixel_rad[at], self.sigma_px[at], self.instrumental_mag[at],
             self.beta[frames], self.optics, self.optics_of[frames],

@@ -4,7 +4,7 @@ What the passes learn of the sensor is a `SensorModel`: its centroid error, its 
 zero point of its brightness.
 
 1. Probe (`_probe`): some scattered frames are searched, with one assumption after the other, until
-   any is identified.
+   any is identified. If none is: by groups of centroids that move together (`moving_groups`).
 2. Sample (`_learn_around`): the model is learned from frames around the identified ones.
 3. All frames (`identify_sample`): followed from frame to frame, searched where that fails.
 4. All frames again (`_identify_again`): only if the probe failed and pass 3 identified some. The
@@ -26,6 +26,7 @@ import numpy.typing as npt
 
 from epipole.tasks.algorithms.star_identification.centroids import RawCentroids, Solutions
 from epipole.tasks.algorithms.star_identification.frame import MatchSettings, Solution
+from epipole.tasks.algorithms.star_identification.moving_groups import moving_groups
 from epipole.tasks.algorithms.star_identification.reidentify_poor_frames import (
     by_quality,
     of_other_brightness,
@@ -47,6 +48,7 @@ from epipole.tasks.algorithms.star_identification.sequence import (
     Priors,
     identify_again,
     identify_sample,
+    no_priors,
     sky_of,
 )
 from epipole.tasks.algorithms.star_identification.star_grid import Sky
@@ -76,6 +78,7 @@ KNOWN_SCALES, UNKNOWN_SCALES_PX = (1.0, 3.0, 0.4), (0.5, 1.5, 0.15)
 WRONG_GATE = 0.02
 
 
+APART_S = 1e9  # in which frames lie that are identified one by one
 # Shares of the searches' budget: of all what the probe may cost, and how many times as much of that
 # a thorough attempt as a quick one; of what is left the pass over all frames, and any other pass.
 PROBE_SHARE, THOROUGH, ALL_SHARE, SHARE = 0.4, 12.0, 0.7, 0.4
@@ -144,6 +147,11 @@ def identify_sensor(
     budget = SearchBudget(n, matching.time_limit_s, matching.budget_share)
     frames = FrameSample(t_s, centroids, priors, budget=budget, rows=np.arange(n, dtype=np.int64))
     model, probe = _probe(frames, skies, magnitude_limit, matching, stated)
+    if probe.failed:
+        anchored = _anchored_by_motion(frames, probe, skies, model, stated)
+        if anchored is not None:
+            frames = anchored
+            model, probe = _probe(frames, skies, magnitude_limit, matching, stated)
     if not probe.failed:
         if stated:
             frames, model, floor_px = _with_floor(frames, probe, skies, model)
@@ -195,13 +203,38 @@ def _probe(
     crowded = typical > CROWDED
     limit = magnitude_limit
     if limit is None:
-        in_view = STARS_IN_CROWD if crowded else STARS_PER_CENTROID * typical or ASSUMED_IN_VIEW
-        limit = skies.limit_for(in_view / centroids.optics[0].solid_angle_sr)
+        limit = _assumed_limit(centroids, typical, crowded, skies)
     model = SensorModel(1.0, limit, magnitude_limit is None, matching, True, not stated)
     rows = usable[aperiodic_rows(len(usable), PROBED_CROWDED if crowded else PROBED)]
     scales = KNOWN_SCALES if stated else UNKNOWN_SCALES_PX
     model, solutions = _first_scale(frames.take(rows), skies, model, scales, crowded)
     return model, _Probe(rows, solutions, usable)
+
+
+def _assumed_limit(centroids: RawCentroids, typical: float, crowded: bool, skies: Skies) -> float:
+    """Return the faintest star to search for in frames of which nothing is known."""
+    in_view = STARS_IN_CROWD if crowded else STARS_PER_CENTROID * typical or ASSUMED_IN_VIEW
+    return skies.limit_for(in_view / centroids.optics[0].solid_angle_sr)
+
+
+def _anchored_by_motion(
+    frames: FrameSample, probe: _Probe, skies: Skies, model: SensorModel, stated: bool
+) -> FrameSample | None:
+    """Return the frames with solutions of probed ones by their moving groups as priors; None where
+    no group is of stars."""
+    groups, of_frame = moving_groups(frames.centroids, frames.t_s, probe.rows)
+    if not len(of_frame):
+        return None
+    # Far apart in time: none is followed from another.
+    apart_s = np.linspace(0.0, APART_S, len(of_frame))
+    parts = FrameSample(
+        apart_s, groups, no_priors(len(of_frame)), budget=frames.budget, rows=of_frame
+    )
+    if model.limit_is_open:
+        model = model._replace(limit=_assumed_limit(groups, 0.0, True, skies))
+    scales = KNOWN_SCALES if stated else UNKNOWN_SCALES_PX
+    _, solutions = _first_scale(parts, skies, model, scales, crowded=False)
+    return frames.anchored(of_frame, solutions) if any(solutions) else None
 
 
 def aperiodic_rows(n: int, wanted: int) -> Rows:

@@ -28,6 +28,11 @@ def test_a_night_without_objects_has_none():
     assert read_solved_chi2(reader_of({})) == (None, None, None)
 
 
+def test_a_state_of_thousands_of_views_counts_with_all_its_freedoms():
+    many = filled("states", chi2=[9_000.0] * 40, dof=[9_000] * 40)
+    assert read_solved_chi2(reader_of({"states": many})).states.mean == pytest.approx(1.0)
+
+
 def test_a_few_values_are_kept_and_many_are_not():
     values = [3.0, 1.0, 2.0]
     few = filled("states", chi2=values, dof=[2] * 3)

@@ -1,6 +1,5 @@
 """A sensor's errors and depth, learned before its frames are identified."""
 
-from functools import cache
 from typing import NamedTuple
 
 import numpy as np
@@ -8,16 +7,16 @@ import pytest
 from scenes.random_stars import (
     CAMERA,
     MATCHING,
+    SEEN,
+    SKIES,
     angle_between,
     frame,
     join_centroids,
     optics,
     random_attitude,
-    random_catalogue,
 )
 
 from epipole.tasks.algorithms.geometry.camera import pixel_angle, project, unproject
-from epipole.tasks.algorithms.star_catalogue import limit_for_density
 from epipole.tasks.algorithms.star_identification import sensor, sequence
 from epipole.tasks.algorithms.star_identification.frame import (
     FrameCentroids,
@@ -27,42 +26,6 @@ from epipole.tasks.algorithms.star_identification.frame import (
 from epipole.tasks.algorithms.star_identification.search_budget import AT_ONCE
 from epipole.tasks.algorithms.star_identification.sensor import identify_sensor
 from epipole.tasks.algorithms.star_identification.sequence import no_priors
-from epipole.tasks.algorithms.star_identification.star_grid import (
-    pattern_pairs,
-    pattern_size,
-    sky_grid,
-    sky_to_limit,
-)
-
-CATALOGUE = random_catalogue(15_000)
-SEEN = sky_to_limit(CATALOGUE, 5.75).catalogue
-
-
-class Skies:
-    """Skies of the random catalogue."""
-
-    def limit_for(self, stars_per_sr):
-        return limit_for_density(CATALOGUE.magnitude, stars_per_sr)
-
-    @cache  # noqa: B019 - lives as long as the tests
-    def sky(self, limit):
-        return sky_to_limit(CATALOGUE, limit)
-
-    @cache  # noqa: B019
-    def grid(self, limit, radius_rad):
-        return sky_grid(self.sky(limit), radius_rad)
-
-    def pairs(self, limit, optics):
-        n = pattern_size(self.sky(limit), optics.solid_angle_sr)
-        return _pairs(n, 2 * optics.half_diagonal_rad)
-
-
-@cache
-def _pairs(n, diagonal_rad):
-    return pattern_pairs(CATALOGUE.u_icrs[:n], diagonal_rad)
-
-
-SKIES = Skies()
 
 
 class Shot(NamedTuple):
