@@ -19,6 +19,9 @@ class KernelLocator(_CacheLocator):
     def __init__(self, function: Callable[..., Any], folder: Path) -> None:
         """Take the folder of the kernel's module."""
         self._path, self._line = folder, function.__code__.co_firstlineno
+        self._py_file = (
+            function.__code__.co_filename
+        )  # numba names it where it cannot keep a kernel
         with contextlib.suppress(OSError):  # it is not there yet
             os.utime(folder)  # it is in use
 

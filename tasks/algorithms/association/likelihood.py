@@ -261,10 +261,14 @@ class _Search:
         """Accept hypotheses, the likeliest first; members that a rival also has are ambiguous."""
         taken = self.space.taken
         # Hypotheses that lost tracklets to a clear group are grown again from their seeds.
-        stale = [h for h in hypotheses if taken[list(h.members)].any()]
-        regrown, _ = self.grow(np.array([h.seed for h in stale], np.int64).reshape(-1, 2))
-        regrown_ids = set(map(id, stale))
-        queue = HypothesisQueue([h for h in hypotheses if id(h) not in regrown_ids] + regrown)
+        intact, seeds = [], []
+        for h in hypotheses:
+            if taken[list(h.members)].any():
+                seeds.append(h.seed)
+            else:
+                intact.append(h)
+        regrown, _ = self.grow(np.array(seeds, np.int64).reshape(-1, 2))
+        queue = HypothesisQueue(intact + regrown)
         while (best := queue.pop()) is not None and best.score >= min_log_odds:
             if taken[list(best.members)].any():
                 if not taken[list(best.seed)].any():
@@ -279,7 +283,8 @@ class _Search:
             rivals = queue.rivals(best, self.margin, self.group != FREE)
             kept = set(best.members).intersection(*(h.members for h in rivals))
             sensors = {int(self.space.views.sensor[i]) for i in kept}
-            # If a hypothesis loses most of its tracklets, the rest is not accepted.
+            # Only members that all rivals have too are beyond doubt. They are accepted if they are
+            # at least half of the hypothesis.
             if len(sensors) >= 2 and 2 * len(kept) >= len(best.members):
                 self._accept(best, kept)
             else:

@@ -70,13 +70,16 @@ class WindowGroups:
         self.ambiguous[rows] = self.undecided[rows] = False
 
     def continue_groups(self, allowed: Flags, briefly_s: float) -> None:
-        """Let tracklets stay together for the rest of their time.
+        """Let the tracklets of a group stay together in neighbouring windows.
 
-        Tracklets of a group may go on into a neighbouring window for a few seconds only: too short
-        a time to show again what is known already. There the group goes on if it is certain and
-        they are undecided, or if all of them but one are seen for `briefly_s` at most. Where one of
-        them is in a group of that window, the others join it, unless their sensor is in it already.
-        Only the `allowed` items, (n,) bool.
+        They may reach into such a window for a few seconds only, too short to be found there again.
+        If none of them has a group there, the group goes on there:
+
+        - if it is certain, and all of them are undecided there;
+        - or if at most one of them is seen there for longer than `briefly_s` [s].
+
+        If some are in one group there, the others that are seen briefly join it, unless that group
+        has a tracklet of their sensor. Only `allowed` items, (n,) bool, get a group.
         """
         items = self.items
         step = items.tracklet.max(initial=0) + 1
@@ -95,7 +98,7 @@ class WindowGroups:
                     self._continue(int(source[members[0]]), row[members], allowed, brief)
 
     def _continue(self, group: int, members: Indices, allowed: Flags, brief: Flags) -> None:
-        """Let a group go on with its members in another window."""
+        """Let a group go on in another window, where its tracklets are the items `members`."""
         joined = np.unique(self.group[members][self.group[members] != FREE])
         free = members[(self.group[members] == FREE) & allowed[members]]
         if not len(joined):
@@ -119,8 +122,9 @@ class WindowGroups:
     def to_decide_again(self, rows: Indices, window_s: float) -> Indices:
         """Return the items of a longer window to decide again; empty if that is useless.
 
-        They belong to no certain group. Their tracklets, and all others of their group, last at
-        least twice the last window, `window_s` [s].
+        These are items of tracklets that last long enough in it, `MIN_LENGTH_RATIO` times the
+        last window, `window_s` [s]. A group is decided again as a whole or not at all: not if it is
+        certain, or if one of its tracklets is too short.
         """
         items = self.items
         _, which = np.unique(items.tracklet[rows], return_inverse=True)
@@ -138,10 +142,11 @@ class WindowGroups:
         return chosen[:0] if alone else chosen
 
     def reconsider(self, rows: Indices, again: Indices, tracklet: Indices, groups: Groups) -> None:
-        """Enter the groups of a longer window for its items `again`.
+        """Enter the groups of a longer window for those of its items that were decided `again`.
 
-        If a new group shares a tracklet with a certain group of a window, its other tracklets join
-        that group in this window, unless their sensor has a tracklet in it already.
+        `rows` are all items of the longer window. In a short window, a new group may share a
+        tracklet with a certain group. Then its other tracklets join the certain group there, unless
+        their sensor has a tracklet in it already.
         """
         items = self.items
         certain = np.setdiff1d(rows, again)

@@ -6,6 +6,9 @@
    the more precise the prediction and the lower the density of false alarms, the more it adds.
 3. The strongest chains become tracks (`new_tracks`).
 
+Where frames have few free detections, faint objects are searched for too, which are detected in a
+third of the frames: pairs reach four frames back, chains `FAINT_FRAMES`.
+
 The rate of a pair limits the evidence that its chain can reach (`_max_evidence`). Pairs that
 cannot reach enough are skipped. In dense frames these are most pairs; no track is lost.
 """
@@ -44,7 +47,7 @@ APART = 2  # maximum number of frames between the detections of a pair
 P_FAINT = 0.35
 LOG_FAINT_MISS, LOG_FAINT_HIT = np.log(1.0 - P_FAINT), np.log(P_FAINT / P_DETECTION)
 LOG_FAINT = np.log(0.5)  # its prior odds
-FAINT_APART, FAINT_FRAMES = 4, 24
+FAINT_APART, FAINT_FRAMES = 4, 24  # as `APART`; frames that a chain reaches back
 MAX_FAINT_MISSES = 8  # in a row; 3 of 100 chains have more
 MAX_FREE = 8.0  # free detections in a frame; with 10, this search would take 10 ms
 N_RATES = 24  # classes of rate for which the maximum evidence is tabulated
@@ -125,7 +128,7 @@ class _Evidence(NamedTuple):
     """How the pairs of two frames are judged.
 
     density : (depth,) float, free detections per steradian in the newest frame and those before
-    best : (N_RATES, k) float, the evidence that earlier frames can still add, see `_max_evidence`
+    best : (N_RATES, k) float, the most that earlier frames can still add, see `_max_evidence`
     log_pairs : ln of the number of pairs, each of which may be a false alarm
     faint : whether objects that are detected in few frames are searched for
     """

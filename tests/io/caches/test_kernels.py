@@ -2,8 +2,11 @@
 
 import os
 import time
+from types import SimpleNamespace
 
 import pytest
+from numba.core.caching import CompileResultCacheImpl
+from numba.core.errors import NumbaWarning
 
 from epipole.io.caches import kernel_locator, kernel_target, kernels
 from epipole.io.caches.kernel_list import read_kernels
@@ -144,6 +147,19 @@ def test_a_folder_that_is_used_is_not_old(tmp_path, monkeypatch):
     assert tmp_path.stat().st_mtime > time.time() - 3600
     monkeypatch.setattr(kernel_locator, "_folder_of", lambda _: None)
     assert KernelLocator.from_function(folder_of, __file__) is None
+
+
+def test_a_kernel_that_cannot_be_kept_is_a_warning(tmp_path):
+    def compiled():
+        """Stand for a kernel."""
+
+    keeping = object.__new__(CompileResultCacheImpl)
+    keeping._locator, keeping._lineno = KernelLocator(compiled, tmp_path), 1
+    lifted = SimpleNamespace(
+        lifted=[SimpleNamespace(can_cache=False)], fndesc=SimpleNamespace(qualname="compiled")
+    )
+    with pytest.warns(NumbaWarning, match="Cannot cache compiled function"):
+        assert not keeping.check_cachable(lifted)
 
 
 FLAGS = "flags\t\t: fpu abm avx avx2 bmi1 bmi2 f16c fma movbe\n"

@@ -1,12 +1,15 @@
 """Lost in space in a crowd: few stars among hundreds of other centroids.
 
-Few pivots of a crowd are stars. Therefore many are tried, each quickly. Only the near companions of
-a pivot vote: the share of stars among them is that among all, and the sky has fewer pairs with such
-a small separation. For each pivot:
+As in `votes`, one centroid, the pivot, is taken for one star after the other, and the centroids
+about it, its companions, vote for the roll of the image. Few centroids of a crowd are stars.
+Therefore many pivots are tried, each quickly. Only the near companions of a pivot vote: the share
+of stars among them is that among all, and the sky has fewer pairs with such a small separation. For
+each pivot:
 
-1. Each star that the pivot may be has near neighbours on the sky. A companion with the separation
-   of a neighbour votes for the roll that puts it there. `roll_votes` counts coarsely how many votes
-   agree on a roll; for a star with many neighbours, a share of them must.
+1. Each star that the pivot may be has near neighbours on the sky. A companion as far from the pivot
+   as a neighbour is from the star votes for the roll that turns the one upon the other.
+   `roll_votes` counts coarsely how many votes agree on a roll. Two to four must; of a star with
+   many neighbours, a share of them.
 2. The votes for the stars that reach enough are counted again, each to its tolerance.
 3. If enough agree, the one with the farthest neighbour gives the attitude. The stars of its field
    are looked up among the centroids (`verify_field`): some twenty look-ups, not a thousand.
