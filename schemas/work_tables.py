@@ -7,6 +7,7 @@ import pyarrow as pa
 from epipole.schemas.attributable import ATTRIBUTABLE_FIELDS
 from epipole.schemas.columns import (
     OPTICS_AXES,
+    POSITION,
     TANGENT_AXES,
     axes,
     column,
@@ -26,6 +27,7 @@ from epipole.schemas.tables import (
     I64,
     OBJECT_ID,
     OBSERVATIONS,
+    POSITIONS,
     SENSOR_ID,
     TRACKLET_FIELDS,
 )
@@ -184,6 +186,30 @@ FITTED_OBSERVATIONS = schema(
         column("row", I64, doc="Row of the night's `observations`; they are in order."),
         *[field for field in FITTED_FIELDS if field.name != "magnitude_1000_km"],
     ],
+)
+
+_SHARE = column("share", I64, doc="Number of the share of objects; rows are sorted by it.")
+_ROW = column("row", I64, doc="Row of the night's table.")
+SHARED_OBSERVATIONS = schema(
+    "shared_observations",
+    "Rows of `observations` that have an object, by the share of objects they are in.",
+    [
+        _SHARE,
+        _ROW,
+        *[
+            OBSERVATIONS.field(name)
+            for name in (
+                "time", "object_id", "tracklet_id", "sensor_id", "ra_deg", "dec_deg",
+                "sigma_ra_arcsec", "sigma_dec_arcsec", "correlation", "bias_sigma_arcsec",
+                *POSITION, "position_sigma_km",
+            )
+        ],
+    ],
+)  # fmt: skip
+SHARED_POSITIONS = schema(
+    "shared_positions",
+    "Rows of `positions`, by the share of objects they are in.",
+    [_SHARE, _ROW, *[POSITIONS.field(name) for name in ("epoch", "time", "object_id", *POSITION)]],
 )
 
 VIEWS = schema(

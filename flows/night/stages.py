@@ -54,6 +54,7 @@ from epipole.tasks.publish.fitted_observations import complete_observations
 from epipole.tasks.publish.night_objects import write_objects
 from epipole.tasks.publish.night_parts import NightParts, publish_nights
 from epipole.tasks.publish.orbits import OrbitRows, fit_orbits, orbit_shares, write_orbits
+from epipole.tasks.publish.share_out import share_out
 from epipole.tasks.publish.write_tables import SHARES, tracklets_of_night, write_tables
 from epipole.tasks.read.order_frames import (
     OrderedFrames,
@@ -324,6 +325,7 @@ def determine_orbits(folder: Path, night: str, linked: pa.Table) -> list[str]:
     Returns the objects whose observations fit no orbit.
     """
     shares = orbit_shares(folder, night)
+    results(Stage.PUBLISH, [share_out.submit(folder, night, shares)])
     futures = [fit_orbits.submit(folder, night, share, shares, linked) for share in range(shares)]
     fitted: list[OrbitRows] = results(Stage.PUBLISH, futures)
     (count,) = results(Stage.PUBLISH, [write_orbits.submit(folder, night, fitted)])

@@ -42,6 +42,8 @@ from epipole.schemas.work_tables import (
     SENSOR_EPOCHS,
     SENSOR_STATES,
     SHARED_ERRORS,
+    SHARED_OBSERVATIONS,
+    SHARED_POSITIONS,
     SIGHTINGS,
     SOLUTIONS,
     TRACKLET_NAMES,
@@ -101,6 +103,8 @@ SOLVED: Final[PartTables] = {
     "object_views": OBJECT_VIEWS,
     "objects": MOVING_OBJECTS,
 }
+SHARED_SEEN: Final[PartTables] = {"observations": SHARED_OBSERVATIONS}
+SHARED_SOLVED: Final[PartTables] = {"positions": SHARED_POSITIONS}
 FITTED: Final[PartTables] = {"observations": FITTED_OBSERVATIONS}
 
 

@@ -12,6 +12,7 @@ from epipole.io.catalogues.earth_orientation import read_earth_orientation
 from epipole.schemas.columns import POSITION
 from epipole.schemas.rejects import Reason
 from epipole.schemas.spans import DAY_NS
+from epipole.schemas.work_tables import SHARED_OBSERVATIONS
 from epipole.tasks.algorithms.constants import (
     ARCSEC,
     EARTH_RADIUS_KM,
@@ -45,10 +46,8 @@ SUNLIT_AREA, AIR_AREA = (0.02, 0.02), (0.03, 0.06)  # mean and sigma [m^2/kg]
 SHORTEST_DRAG_S = 1800.0  # in less the air moves no satellite above 300 km by its errors
 GRAVITY, RADIATION, DRAG = "GM J2-J4 C22 Sun Moon", "radiation", "drag"
 
-OBSERVED = [
-    "time", "object_id", "tracklet_id", "sensor_id", "ra_deg", "dec_deg", "sigma_ra_arcsec",
-    "sigma_dec_arcsec", "correlation", "bias_sigma_arcsec", *POSITION, "position_sigma_km",
-]  # fmt: skip
+# Columns of OBSERVATIONS that orbits are fitted to.
+OBSERVED = [name for name in SHARED_OBSERVATIONS.names if name not in ("share", "row")]
 
 
 class Start(NamedTuple):

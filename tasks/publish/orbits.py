@@ -1,7 +1,6 @@
 """Orbits: one of each object of a night, fitted to all observations of it."""
 
-import zlib
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -37,7 +36,6 @@ from epipole.tasks.algorithms.orbits.orbital_elements import (
 from epipole.tasks.common.stage_tasks import stage_task
 from epipole.tasks.publish.fitted_observations import fitted_part, write_fitted
 from epipole.tasks.publish.object_orbits import (
-    OBSERVED,
     FittedOrbit,
     ObservedObjects,
     Start,
@@ -50,6 +48,7 @@ from epipole.tasks.publish.object_orbits import (
     turned,
 )
 from epipole.tasks.publish.sensor_errors import SensorSums, sensor_errors
+from epipole.tasks.publish.share_out import of_share
 
 Array = npt.NDArray[np.float64]
 
@@ -79,18 +78,19 @@ def orbit_shares(folder: Path, night: str) -> int:
 def fit_orbits(
     folder: Path, night: str, share: int, shares: int, linked: pa.Table | None = None
 ) -> OrbitRows:
-    """Fit the orbits of a share of the objects of a night whose other tables are written.
+    """Fit the orbits of a share of the objects of a night, after `share_out`.
 
     The orbit of an object depends on the rows of this object only. `linked` are LINKED_ORBITS:
     the initial states of objects without positions. What an orbit adds to its observations goes to
     a part; see `write_fitted`.
     """
     reader = NightReader.of_folder(folder, night)
-    observed = of_share(reader, "observations", OBSERVED, share, shares)
+    observed = of_share(folder, "observations", share)
     observed = observed.sort("object_id", "time", "sensor_id", "tracklet_id")
     around, origin_ns = surroundings_of(night), noon_ns(night)
     objects = observed_objects(observed, origin_ns, around)
-    starts = initial_states(reader, objects.names)
+    positions = of_share(folder, "positions", share)
+    starts = initial_states(reader, objects.names, positions)
     if linked is not None:
         rows = to_polars(linked)
         starts = _starts(rows, rows.select(*POSITION, *VELOCITY).to_numpy()) | starts
@@ -102,8 +102,6 @@ def fit_orbits(
     sound = {k: each for k, each in enumerate(fitted) if each is not None and reasons[k] is None}
     failed = [k for k in range(len(fitted)) if k not in sound]
     without = {objects.names[k] for k in failed}
-    columns = ["time", "object_id", *POSITION]
-    positions = of_share(reader, "positions", columns, share, shares)
     positions = positions.filter(pl.col("object_id").is_in(without))
     write_fitted(
         fitted_part(folder, share, shares), observed, objects.slices(), sound, positions, origin_ns,
@@ -140,30 +138,9 @@ def write_orbits(folder: Path, night: str, fitted: Sequence[OrbitRows]) -> int:
     return write_table(folder, "orbits", [orbits])
 
 
-def of_share(
-    reader: NightReader, name: str, columns: Sequence[str], share: int, shares: int
-) -> pl.DataFrame:
-    """Return the rows of a share of the objects; the share follows from the id alone.
-
-    `row` is each one's row in the night's table.
-    """
-    pieces = _pieces(reader, name, columns, share, shares)
-    return pl.concat([reader.empty(name, columns).with_row_index("row"), *pieces])
-
-
-def _pieces(
-    reader: NightReader, name: str, columns: Sequence[str], share: int, shares: int
-) -> Iterator[pl.DataFrame]:
-    first = 0
-    for piece in reader.pieces(name, columns):
-        rows = piece.with_row_index("row", first).filter(pl.col("object_id").is_not_null())
-        first += len(piece)
-        ids = rows["object_id"].unique()
-        mine = [name for name in ids if zlib.crc32(name.encode()) % shares == share]
-        yield rows.filter(pl.col("object_id").is_in(mine))
-
-
-def initial_states(reader: NightReader, objects: Sequence[str]) -> dict[str, Start]:
+def initial_states(
+    reader: NightReader, objects: Sequence[str], positions: pl.DataFrame
+) -> dict[str, Start]:
     """Return an initial state of each object: its best-observed state, else by its positions."""
     columns = ["epoch", "object_id", *POSITION, *VELOCITY, "n_views"]
     wanted = pl.col("object_id").is_in(list(objects))
@@ -172,12 +149,8 @@ def initial_states(reader: NightReader, objects: Sequence[str]) -> dict[str, Sta
         "object_id", keep="first", maintain_order=True
     )
     found = _starts(best, best.select(*POSITION, *VELOCITY).to_numpy())
-    columns = ["epoch", "object_id", *POSITION]
     without = wanted & pl.col("object_id").is_in(list(found)).not_()
-    pieces = [rows.filter(without) for rows in reader.pieces("positions", columns)]
-    for (_,), rows in pl.concat([reader.empty("positions", columns), *pieces]).group_by(
-        ["object_id"], maintain_order=True
-    ):
+    for _, rows in positions.filter(without).group_by(["object_id"], maintain_order=True):
         found |= _from_positions(rows)
     return found
 

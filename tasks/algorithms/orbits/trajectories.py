@@ -204,9 +204,10 @@ def positions_at(path: Trajectory, time_s: Array) -> Array:
     k = np.clip(np.floor((time_s - path.start_s) / h).astype(np.int64), 0, last)
     u = ((time_s - path.start_s) / h - k)[:, None]
     rise, v0, v1, a0, a1 = _quintic.py_func(u, h)
-    p, q, dp, dq = path.values[k], path.values[k + 1], path.rates[k], path.rates[k + 1]
-    moved = (q[:, :3] - p[:, :3]) * rise + v0 * p[:, 3:6] + v1 * q[:, 3:6]
-    return np.asarray(p[:, :3] + moved + a0 * dp[:, 3:6] + a1 * dq[:, 3:6])
+    # Of the nodes, before any is copied: they have derivatives by the unknowns too.
+    r, v, a = path.values[:, :3], path.values[:, 3:6], path.rates[:, 3:6]
+    moved = (r[k + 1] - r[k]) * rise + v0 * v[k] + v1 * v[k + 1]
+    return np.asarray(r[k] + moved + a0 * a[k] + a1 * a[k + 1])
 
 
 def propagate_unknowns(

@@ -4,7 +4,8 @@ What the passes learn of the sensor is a `SensorModel`: its centroid error, its 
 zero point of its brightness.
 
 1. Probe (`_probe`): some scattered frames are searched, with one assumption after the other, until
-   any is identified. If none is: by groups of centroids that move together (`moving_groups`).
+   any is identified. Groups of centroids that move together (`moving_groups`) are searched first in
+   crowds, last elsewhere.
 2. Sample (`_learn_around`): the model is learned from frames around the identified ones.
 3. All frames (`identify_sample`): followed from frame to frame, searched where that fails.
 4. All frames again (`_identify_again`): only if the probe failed and pass 3 identified some. The
@@ -61,6 +62,7 @@ MIN_CENTROIDS = 4  # of a frame that takes part in the probe and the sample
 # Frames of the probe; more where frames are crowded: the typical frame has more than `CROWDED`
 # centroids, so most are no stars.
 PROBED, PROBED_CROWDED, CROWDED = 5, 8, 100
+MANY = 40  # centroids of a typical frame, of which most may be satellites
 # The number of stars in a crowded field is unknown: the first number is assumed, then a sky that is
 # deeper by the second.
 STARS_IN_CROWD, DEEPER_IN_CROWD_MAG = 25.0, 1.5
@@ -146,12 +148,7 @@ def identify_sensor(
     n, floor_px = len(t_s), 0.0
     budget = SearchBudget(n, matching.time_limit_s, matching.budget_share)
     frames = FrameSample(t_s, centroids, priors, budget=budget, rows=np.arange(n, dtype=np.int64))
-    model, probe = _probe(frames, skies, magnitude_limit, matching, stated)
-    if probe.failed:
-        anchored = _anchored_by_motion(frames, probe, skies, model, stated)
-        if anchored is not None:
-            frames = anchored
-            model, probe = _probe(frames, skies, magnitude_limit, matching, stated)
+    frames, model, probe = _probe(frames, skies, magnitude_limit, matching, stated)
     if not probe.failed:
         if stated:
             frames, model, floor_px = _with_floor(frames, probe, skies, model)
@@ -195,8 +192,9 @@ def _probe(
     magnitude_limit: float | None,
     matching: MatchSettings,
     stated: bool,
-) -> tuple[SensorModel, _Probe]:
-    """Return a first model, with which some of the probed frames are identified, and these."""
+) -> tuple[FrameSample, SensorModel, _Probe]:
+    """Return the frames, a first model, with which some of the probed ones are identified, and
+    these. Moving groups have given some frames a prior, if they were searched."""
     centroids = frames.centroids
     usable = np.flatnonzero(centroids.counts >= MIN_CENTROIDS)
     typical = float(np.median(centroids.counts[usable])) if len(usable) else 0.0
@@ -204,11 +202,19 @@ def _probe(
     limit = magnitude_limit
     if limit is None:
         limit = _assumed_limit(centroids, typical, crowded, skies)
-    model = SensorModel(1.0, limit, magnitude_limit is None, matching, True, not stated)
+    first = SensorModel(1.0, limit, magnitude_limit is None, matching, True, not stated)
     rows = usable[aperiodic_rows(len(usable), PROBED_CROWDED if crowded else PROBED)]
     scales = KNOWN_SCALES if stated else UNKNOWN_SCALES_PX
-    model, solutions = _first_scale(frames.take(rows), skies, model, scales, crowded)
-    return model, _Probe(rows, solutions, usable)
+    # The groups of a crowd are searched sooner than its frames; most other frames need none.
+    if typical > MANY:
+        frames = _anchored_by_motion(frames, rows, skies, first, scales)
+    model, solutions = _first_scale(frames.take(rows), skies, first, scales, crowded)
+    if typical <= MANY and not any(solutions):
+        anchored = _anchored_by_motion(frames, rows, skies, first, scales)
+        if anchored is not frames:
+            frames = anchored
+            model, solutions = _first_scale(frames.take(rows), skies, first, scales, crowded)
+    return frames, model, _Probe(rows, solutions, usable)
 
 
 def _assumed_limit(centroids: RawCentroids, typical: float, crowded: bool, skies: Skies) -> float:
@@ -218,13 +224,13 @@ def _assumed_limit(centroids: RawCentroids, typical: float, crowded: bool, skies
 
 
 def _anchored_by_motion(
-    frames: FrameSample, probe: _Probe, skies: Skies, model: SensorModel, stated: bool
-) -> FrameSample | None:
-    """Return the frames with solutions of probed ones by their moving groups as priors; None where
-    no group is of stars."""
-    groups, of_frame = moving_groups(frames.centroids, frames.t_s, probe.rows)
+    frames: FrameSample, rows: Rows, skies: Skies, model: SensorModel, scales: tuple[float, ...]
+) -> FrameSample:
+    """Return the frames with solutions of these rows' moving groups as priors; the same frames
+    where no group is of stars."""
+    groups, of_frame = moving_groups(frames.centroids, frames.t_s, rows)
     if not len(of_frame):
-        return None
+        return frames
     # Far apart in time: none is followed from another.
     apart_s = np.linspace(0.0, APART_S, len(of_frame))
     parts = FrameSample(
@@ -232,9 +238,8 @@ def _anchored_by_motion(
     )
     if model.limit_is_open:
         model = model._replace(limit=_assumed_limit(groups, 0.0, True, skies))
-    scales = KNOWN_SCALES if stated else UNKNOWN_SCALES_PX
     _, solutions = _first_scale(parts, skies, model, scales, crowded=False)
-    return frames.anchored(of_frame, solutions) if any(solutions) else None
+    return frames.anchored(of_frame, solutions) if any(solutions) else frames
 
 
 def aperiodic_rows(n: int, wanted: int) -> Rows:

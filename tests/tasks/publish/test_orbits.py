@@ -1,5 +1,7 @@
 """Orbits of a night: a row per object whose observations fit one, else a row of `rejects`."""
 
+import shutil
+
 import numpy as np
 import polars as pl
 import pytest
@@ -20,6 +22,7 @@ from epipole.tasks.publish import orbits
 from epipole.tasks.publish.fitted_observations import complete_observations
 from epipole.tasks.publish.object_orbits import surroundings_of
 from epipole.tasks.publish.orbits import fit_orbits, write_orbits
+from epipole.tasks.publish.share_out import share_out
 
 NIGHT = "2026-05-30"
 R = surroundings_of(NIGHT).R_night_from_gcrf
@@ -77,6 +80,8 @@ def written(folder, seen, states=(), places=()):
 
 def made(folder, shares=1):
     """Return the orbits and the rejects of a night."""
+    shutil.rmtree(folder.with_name(f"{folder.name}-shared"), ignore_errors=True)
+    share_out.fn(folder, NIGHT, shares)
     fitted = [fit_orbits.fn(folder, NIGHT, k, shares) for k in range(shares)]
     assert write_orbits.fn(folder, NIGHT, fitted) == sum(each.orbits.num_rows for each in fitted)
     rejects = read_columns(folder, "rejects", REJECTS.names)
