@@ -11,6 +11,7 @@ import pyarrow as pa
 from prefect import flow
 
 from epipole.flows.night.calibrating import calibrate, find_cameras
+from epipole.flows.night.doubt import settle
 from epipole.flows.night.log_checks import check_logs, check_readings
 from epipole.flows.night.log_choice import LastNights, Night, find_logs, night_asked, run_name
 from epipole.flows.night.recorded_nights import (
@@ -275,13 +276,14 @@ def make_night(
     while True:
         work = track(work, night, settings)
         solved = solve(work, settings)
-        work, again, left_out = check(work, solved, settings)
-        if not again:
-            break  # else: back to `track`, with corrected times
-    if left_out:
-        solved = solve(work, settings, left_out)
-    tables = {"checks": check_readings(work, checks), "calibrations": calibrations}
-    return MadeNight(work, solved, tables, uncalibrated)
+        checked = check(work, solved, settings)
+        if not checked.again:
+            break
+        work = checked.work  # back to `track`, with corrected times
+    settled = settle(work, solved, checked, settings)
+    checks = check_readings(settled, frames, checks)
+    tables = {"checks": checks, "calibrations": calibrations}
+    return MadeNight(settled.work, settled.solved, tables, uncalibrated)
 
 
 def choose_nights(

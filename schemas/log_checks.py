@@ -107,6 +107,12 @@ class LogCheck(StrEnum):
         "written; only a run compares them.",
         "{percent:.3g} % of its views meet those of other sensors",
     )
+    SENSORS_AGREE = (
+        "sensors_agree",
+        "Error that was added to the positions of all sensors, per axis: only a run in which "
+        "sensors disagree has it, where who is wrong is not clear.",
+        "sensors agree",
+    )
     UTC_TIMES = (
         "utc_times",
         "Written times minus UTC, by satellites of the catalogue; only a run with one compares "
@@ -454,6 +460,34 @@ class LogCause(StrEnum):
         "{percent:.3g} % of its views meet those of other sensors, and no ordinary mistake "
         "explains it: they look at other objects, or the mistake is not known",
         "",
+    )
+    SENSORS_IN_DOUBT = (
+        "sensors_in_doubt",
+        CheckVerdict.WRONG,
+        "lines of sight of sensors miss each other, and who is wrong is not clear: the positions "
+        "of all sensors got an error of {value:.2g} km per axis",
+        "compare their ephemerides, clocks and frames of reference",
+    )
+    SHARED_OFFSET = (
+        "shared_offset",
+        CheckVerdict.WRONG,
+        "lines of sight meet if times of frames are {offset_s:+.3f} s (sigma {sigma_s:.3f} s) from "
+        "those of states, in all sensors; their positions got an error of {value:.2g} km per axis",
+        "write UTC in both, and the middle of the exposure; or ephemerides are off along the orbit",
+    )
+    EXPOSURE_START = (
+        "exposure_start",
+        CheckVerdict.WRONG,
+        "times of frames are {offset_s:+.3f} s (sigma {sigma_s:.3f} s) from those of states, by "
+        "lines of sight: exposures last {exposure_s:.3g} s, so these are their starts",
+        "write the middle of the exposure",
+    )
+    EXPOSURE_END = (
+        "exposure_end",
+        CheckVerdict.WRONG,
+        "times of frames are {offset_s:+.3f} s (sigma {sigma_s:.3f} s) from those of states, by "
+        "lines of sight: exposures last {exposure_s:.3g} s, so these are their ends",
+        "write the middle of the exposure",
     )
     TIMES_NOT_UTC = (
         "times_not_utc",

@@ -435,6 +435,11 @@ class ObjectVerdict(Declared):
         "More than two sensors have views of it, which miss each other by more than their errors "
         "explain; or most of its positions were solved without one of the views.",
     )
+    SENSORS_IN_DOUBT = (
+        "sensors_in_doubt",
+        "Sensors of the night disagree, and who is wrong is not clear: the errors of its positions "
+        "are as large as that shows; see `checks`.",
+    )
     ORBIT_MISFIT = (
         "orbit_misfit",
         "No single orbit fits its observations: it changed its orbit, or they are of more than "

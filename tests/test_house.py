@@ -19,7 +19,6 @@ SMALL = {
     "tasks/algorithms/sensor_faults": "above all other mathematics",
     "tasks/algorithms/tracking/linking": "a published method beside the default",
     "tasks/calibrate": "a stage",
-    "tasks/check": "a stage",
     "tasks/track": "a stage",
     "tasks/overlay": "a flow's tasks",
     "tasks/simulate": "a flow's tasks: the pipeline may not read it",

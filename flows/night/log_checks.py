@@ -3,17 +3,20 @@
 import logging
 from collections.abc import Sequence
 
+import numpy as np
 import pyarrow as pa
 
+from epipole.flows.night.doubt import Settled
 from epipole.flows.night.progress import results
-from epipole.flows.night.work import Work
 from epipole.io.datasets.rows_by_night import rows_of_night
-from epipole.schemas.bridge import concat
+from epipole.io.work.parts import read_part
+from epipole.schemas.bridge import array, concat
 from epipole.schemas.log_checks import mistakes
 from epipole.schemas.settings import Settings
 from epipole.schemas.spans import DAY_NS, SPAN_NS, day_of
 from epipole.schemas.stages import Stage
 from epipole.schemas.tables import CHECKS
+from epipole.tasks.check.judge_doubt import doubt_table, name_cut_times
 from epipole.tasks.check.judge_readings import judge_readings
 from epipole.tasks.common.batches import in_batches
 from epipole.tasks.read.judge_logs import (
@@ -63,12 +66,23 @@ def check_logs(
     return _with_warnings(concat(CHECKS, [*results(Stage.READ, futures), absent]))
 
 
-def check_readings(work: Work, checks: pa.Table) -> pa.Table:
+def check_readings(settled: Settled, frames: OrderedFrames, checks: pa.Table) -> pa.Table:
     """Return CHECKS with what the lines of sight of a night say of the sensors' states."""
+    work, doubt = settled.work, settled.doubt
     viewed = work.folder.viewed(work.round)
+    checks = name_cut_times(checks, settled.clocks, doubt)
     judged = judge_readings.submit(viewed, list(work.spans), work.all_spans())
     (found,) = results(Stage.CHECK, [judged])
+    if doubt is not None:
+        exposure_s = {name: _exposure_s(frames, number) for number, name in work.spans}
+        found = concat(CHECKS, [found, doubt_table(doubt, settled.solved.more_km, exposure_s)])
     return concat(CHECKS, [checks, _with_warnings(found)])
+
+
+def _exposure_s(frames: OrderedFrames, sensor: int) -> float:
+    """Return the median exposure time of a sensor's frames, 0 where it is unknown."""
+    pieces = [read_part(piece, "exposures", ["exposure_s"]) for piece in frames.pieces[sensor]]
+    return float(np.median(array(pa.concat_tables(pieces), "exposure_s")))
 
 
 def _with_warnings(checks: pa.Table) -> pa.Table:

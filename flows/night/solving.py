@@ -71,9 +71,11 @@ class _Night(NamedTuple):
 
 
 def solve_objects(
-    work: Work, settings: Settings, left_out: Mapping[str, Reason]
+    work: Work, settings: Settings, left_out: Mapping[str, Reason], more_km: float = 0.0
 ) -> tuple[SolvedParts, int]:
     """Find and solve the objects of all sensors but those left out.
+
+    With `more_km`, the positions of all sensors have this error more, 1-sigma per axis.
 
     Returns
     -------
@@ -82,7 +84,7 @@ def solve_objects(
     count
         Number of positions.
     """
-    solved = work.folder.solved(work.round, all_sensors=not left_out)
+    solved = work.folder.solved(work.round, not left_out, more_km)
     grid = epoch_grid(work, settings)
     night = _Night(list(work.spans), work.all_spans(), grid, work, settings, solved)
     n_views = _view(night)
@@ -147,7 +149,7 @@ def _associate(night: _Night, n_views: Mapping[Span, int], left_out: Mapping[str
                 associate_blocks.submit(
                     night.sensors, night.viewed, of_task, night.work.cameras, left_out,
                     night.settings.association, night.settings.alignment.window_s,
-                    night.settings.work.max_views, night.solved.blocks,
+                    night.settings.work.max_views, night.solved.blocks, night.solved.more_km,
                 )
             )  # fmt: skip
     results(Stage.SOLVE, futures, (1, STEPS))

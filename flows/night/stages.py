@@ -27,6 +27,7 @@ from epipole.schemas.spans import DAY_NS, SPAN_NS, Span, day_of
 from epipole.schemas.stages import Stage
 from epipole.schemas.tables import POSITIONS, REJECTS, STATES
 from epipole.schemas.work_tables import OBJECT_DETECTIONS
+from epipole.tasks.algorithms.sensor_faults.fault_judgement import Doubt
 from epipole.tasks.check.check_sensors import (
     REASONS,
     SensorVerdict,
@@ -136,10 +137,13 @@ def track(work: Work, night: str, settings: Settings) -> Work:
 
 
 def solve(
-    work: Work, settings: Settings, left_out: Mapping[str, Reason] | None = None
+    work: Work,
+    settings: Settings,
+    left_out: Mapping[str, Reason] | None = None,
+    more_km: float = 0.0,
 ) -> SolvedParts:
     """Find and solve objects, from all sensors but those left out; see `solve_objects`."""
-    solved, count = solve_objects(work, settings, left_out or {})
+    solved, count = solve_objects(work, settings, left_out or {}, more_km)
     LOGGER.info("solved %s", many(count, "position"))
     return solved
 
@@ -148,27 +152,29 @@ class Checked(NamedTuple):
     """The result of the check of the sensors.
 
     With `again`, clocks were corrected and the night goes back to `track`. `left_out` are sensors
-    that stay at fault, each with its reason: the night is solved again without them.
+    that stay at fault, each with its reason: the night is solved again without them. `doubt` is
+    what is wrong with sensors of which none can be named.
     """
 
     work: Work
     again: bool
     left_out: dict[str, Reason]
+    doubt: Doubt
 
 
-def check(work: Work, solved: SolvedParts, settings: Settings) -> Checked:
-    """Judge the sensors by all spans; correct wrong clocks if the settings say so."""
+def check(work: Work, solved: SolvedParts, settings: Settings, correct: bool = True) -> Checked:
+    """Judge the sensors by all spans; `correct` wrong clocks if the settings say so too."""
     step(Stage.CHECK, 0, 1)
     viewed, spans = work.folder.viewed(work.round), work.all_spans()
-    verdicts: list[SensorVerdict] = check_sensors(solved, viewed, list(work.spans), spans)
+    verdicts, doubt = check_sensors(solved, viewed, list(work.spans), spans)
     log_verdicts(verdicts)
     faulty = [verdict for verdict in verdicts if verdict.is_faulty]
     late = [verdict for verdict in faulty if verdict.has_wrong_clock]
     work = work._replace(verdicts=tuple(add_corrections(work.verdicts, verdicts)))
-    correctable = settings.alignment.correct_clocks and work.round < MAX_CORRECTIONS
+    correctable = correct and settings.alignment.correct_clocks and work.round < MAX_CORRECTIONS
     if late and correctable:
-        return Checked(_correct_clocks(work, late, settings), again=True, left_out={})
-    return Checked(work, again=False, left_out=_taking_part(work, solved, faulty))
+        return Checked(_correct_clocks(work, late, settings), True, {}, doubt)
+    return Checked(work, False, _taking_part(work, solved, faulty), doubt)
 
 
 def log_verdicts(verdicts: Sequence[SensorVerdict]) -> None:

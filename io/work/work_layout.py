@@ -79,10 +79,13 @@ class WorkFolder(NamedTuple):
         """Return the parts with the views of all sensors."""
         return ViewedParts(self.root / Stage.SOLVE / str(round_) / "views")
 
-    def solved(self, round_: int, all_sensors: bool = True) -> "SolvedParts":
-        """Return the parts of `solve`: of all sensors, or without those left out."""
-        which = "all" if all_sensors else "some"
-        return SolvedParts(self.root / Stage.SOLVE / str(round_) / which)
+    def solved(self, round_: int, all_sensors: bool = True, more_km: float = 0.0) -> "SolvedParts":
+        """Return the parts of `solve`: of all sensors, or without those left out.
+
+        `more_km` is that of the parts.
+        """
+        which = ("all" if all_sensors else "some") + (f"-{more_km:g}-km" if more_km else "")
+        return SolvedParts(self.root / Stage.SOLVE / str(round_) / which, more_km)
 
 
 @dataclass(frozen=True)
@@ -97,9 +100,13 @@ class ViewedParts:
 
 
 class SolvedParts(NamedTuple):
-    """Where `solve` puts what it finds of the objects of all sensors."""
+    """Where `solve` puts what it finds of the objects of all sensors.
+
+    The positions of all sensors get the error `more_km`, 1-sigma per axis, beside the stated one.
+    """
 
     root: Path
+    more_km: float = 0.0
 
     @property
     def blocks(self) -> Parts:

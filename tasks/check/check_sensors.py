@@ -25,6 +25,7 @@ from epipole.tasks.algorithms.sensor_faults.fault_judgement import (
     DISAGREES,
     EPHEMERIS,
     SOUND,
+    Doubt,
     Lines,
 )
 from epipole.tasks.algorithms.sensor_faults.suspects import judge_many_sensors
@@ -95,10 +96,20 @@ class SensorVerdict(NamedTuple):
         )
 
 
+class JudgedSights(NamedTuple):
+    """The verdicts on those sensors that a night's lines of sight can judge.
+
+    `doubt` is what is wrong with sensors of which none can be named.
+    """
+
+    verdicts: list[SensorVerdict]
+    doubt: Doubt = Doubt()
+
+
 @stage_task(Stage.CHECK, "sensors")
 def check_sensors(
     solved: SolvedParts, viewed: ViewedParts, sensors: Sequence[Sensor], spans: Sequence[Span]
-) -> list[SensorVerdict]:
+) -> JudgedSights:
     """Return the verdicts on those sensors that the night's lines of sight can judge.
 
     Parameters
@@ -110,7 +121,7 @@ def check_sensors(
     """
     epochs = _epochs(solved, spans)
     if not len(epochs):
-        return []
+        return JudgedSights([])
     lines, objects = (
         _with_ids_of_night(solved, spans, name, epochs) for name in ("lines", "objects")
     )
@@ -191,7 +202,7 @@ def _candidate_pairs(
 
 def sensor_verdicts(
     rows: pl.DataFrame, first_guess: Mapping[str, float] | None = None
-) -> list[SensorVerdict]:
+) -> JudgedSights:
     """Return the verdicts on those sensors that CLOCK_LINES can judge, by sensor.
 
     `first_guess` has initial clock offsets by sensor [s].
@@ -199,7 +210,7 @@ def sensor_verdicts(
     guess = first_guess or {}
     rows = rows.sort("epoch", "object_id", "sensor_id")
     if not len(rows):
-        return []
+        return JudgedSights([])
     # A quantile: blends in a few tracklets are not an error of the attitude.
     spread = (pl.col("cov_bias_11_rad2") + pl.col("cov_bias_22_rad2")) / 2
     bias = rows.group_by("sensor_id").agg(
@@ -214,10 +225,11 @@ def sensor_verdicts(
     verdicts = [
         SensorVerdict(name, float(offset), float(sigma), cause, float(size), float(size_sigma))
         for name, offset, sigma, cause, size, size_sigma in zip(
-            bias["sensor_id"], *judged, strict=True
+            bias["sensor_id"], *judged[:5], strict=True
         )
     ]
-    return [one for one in verdicts if one.sigma_s < MAX_KNOWN_SIGMA_S or one.is_faulty]
+    known = [one for one in verdicts if one.sigma_s < MAX_KNOWN_SIGMA_S or one.is_faulty]
+    return JudgedSights(known, judged.doubt)
 
 
 def _search_clock(free: pl.DataFrame) -> tuple[float, pl.DataFrame] | None:

@@ -14,6 +14,7 @@ from epipole.schemas.bridge import from_polars
 from epipole.schemas.rejects import Found, NameStatus, ObjectVerdict
 from epipole.schemas.stages import Stage
 from epipole.schemas.tables import OBJECTS
+from epipole.tasks.algorithms.log_checks.findings import SENSORS_AGREE
 from epipole.tasks.common.stage_tasks import stage_task
 
 MOST = 0.5  # share of an object's observations or positions
@@ -44,6 +45,8 @@ def objects_of(reader: NightReader, misfits: Collection[str]) -> pa.Table:
     rows = seen.join(solved, on="object_id", how="full", coalesce=True, suffix="_solved")
     rows = rows.with_columns(pl.col(r"^n_.*$").fill_null(0))
     has_orbit = reader.read("orbits", ["object_id"])["object_id"]
+    in_doubt = SENSORS_AGREE in reader.read("checks", ["check"])["check"].to_list()
+    rows = rows.with_columns(in_doubt=pl.lit(in_doubt) & (pl.col("n_positions") > 0))
     rows = rows.with_columns(
         first_time=pl.min_horizontal("first_time", "first_time_solved"),
         last_time=pl.max_horizontal("last_time", "last_time_solved"),
@@ -134,6 +137,7 @@ def _verdicts(rows: pl.DataFrame, misfits: pl.Series, has_orbit: pl.Series) -> p
         ObjectVerdict.BLENDED: pl.col("n_blended") > MOST * pl.col("n_observations"),
         ObjectVerdict.TWO_SENSORS_DISAGREE: disagrees & is_two,
         ObjectVerdict.SENSORS_DISAGREE: disagrees | is_rejected,
+        ObjectVerdict.SENSORS_IN_DOUBT: pl.col("in_doubt"),
         ObjectVerdict.ORBIT_MISFIT: pl.col("object_id").is_in(misfits.implode()),
         ObjectVerdict.NO_ORBIT: pl.col("object_id").is_in(has_orbit.implode()).not_(),
     }

@@ -41,7 +41,9 @@ def observations(parts: NightParts) -> Iterator[pa.Table]:
             seen = with_objects(to_polars(concat(SIGHTINGS, rows)), runs)
             seen = seen.filter(pl.col("tracklet_id").is_in(hot.implode()).not_())
             seen = with_links(published(seen), parts)
-            seen = with_shared_errors(seen, errors).with_columns(**_NOT_FITTED)
+            seen = with_shared_errors(seen, errors, parts.solved.more_km).with_columns(
+                **_NOT_FITTED
+            )
             yield from_polars(OBSERVATIONS, seen)
 
 
@@ -167,12 +169,19 @@ def _shared_errors(parts: NightParts, span: Span) -> pl.DataFrame:
     return to_polars(concat(SHARED_ERRORS, tables))
 
 
-def with_shared_errors(rows: pl.DataFrame, errors: pl.DataFrame) -> pl.DataFrame:
-    """Return the rows; shared errors that are larger than stated are as large as they are."""
+def with_shared_errors(rows: pl.DataFrame, errors: pl.DataFrame, more_km: float) -> pl.DataFrame:
+    """Return the rows; shared errors that are larger than stated are as large as they are.
+
+    `more_km` is added to the errors of all positions of sensors, 1-sigma per axis.
+    """
     factors = rows.select("sensor_id").join(
         errors, on="sensor_id", how="left", maintain_order="left"
     )
     return rows.with_columns(
         pl.col("bias_sigma_arcsec") * factors["direction"].fill_null(1.0).sqrt(),
-        pl.col("position_sigma_km") * factors["position"].fill_null(1.0).sqrt(),
+        (
+            (pl.col("position_sigma_km") ** 2 + more_km**2) * factors["position"].fill_null(1.0)
+        ).sqrt()
+        if more_km
+        else pl.col("position_sigma_km") * factors["position"].fill_null(1.0).sqrt(),
     )

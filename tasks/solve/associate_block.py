@@ -8,7 +8,6 @@
 """
 
 from collections.abc import Iterable, Mapping, Sequence
-from functools import partial
 
 import numpy as np
 import polars as pl
@@ -29,6 +28,7 @@ from epipole.tasks.common.sightings import published_ids
 from epipole.tasks.common.stage_tasks import stage_task
 from epipole.tasks.solve.associate_objects import Associated, associate_objects
 from epipole.tasks.solve.association_input import BlockViews, SensorViews
+from epipole.tasks.solve.view_groups import with_position_error
 
 _RANK = {outcome.value: rank for rank, outcome in enumerate(Outcome)}
 
@@ -80,6 +80,7 @@ def associate_blocks(
     half_width_s: float,
     max_views: int,
     parts: Parts,
+    more_km: float = 0.0,
 ) -> None:
     """Find the objects of some blocks of one span, unless the parts exist.
 
@@ -97,11 +98,13 @@ def associate_blocks(
         Limit of the views that a task has in memory at the same time.
     parts
         Where the parts go: `ASSOCIATED` of each block.
+    more_km
+        Error that is added to the positions of all sensors, 1-sigma per axis.
     """
     for block in blocks:
         if not parts.holds(block):
             views = [
-                sensor_views(sensor, viewed[sensor.number], block.span)
+                sensor_views(sensor, viewed[sensor.number], block.span, more_km)
                 for sensor in sensors
                 if viewed[sensor.number].holds(block.span)
             ]
@@ -125,12 +128,12 @@ def blocks_of(span: Span, settings: AssociationSettings) -> list[Span]:
     return [span] if settings.window_s * 1e9 > BLOCK_NS else span.blocks
 
 
-def sensor_views(sensor: Sensor, viewed: Parts, span: Span) -> SensorViews:
+def sensor_views(sensor: Sensor, viewed: Parts, span: Span, more_km: float = 0.0) -> SensorViews:
     """Return the views of a sensor in a span, mapped into memory."""
     return SensorViews(
         sensor.number,
         sensor.sensor_id,
-        partial(viewed.read, span, "views"),
+        lambda: with_position_error(viewed.read(span, "views"), more_km),
         viewed.read(span, "epochs"),
         viewed.read(span, "tracklets"),
     )

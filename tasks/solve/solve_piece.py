@@ -33,9 +33,11 @@ from epipole.tasks.solve.sample_sight_lines import (
 )
 from epipole.tasks.solve.states import fit_states, judge_errors, refuse_misfits
 from epipole.tasks.solve.view_groups import (
+    ObjectViews,
     ViewGroups,
     unpack_views,
     with_larger_errors,
+    with_position_error,
     with_stated_errors,
 )
 
@@ -43,7 +45,7 @@ Indices = npt.NDArray[np.int64]
 
 
 def gather_views(
-    viewed: ViewedParts, members: pa.Table, time: Span, every_ns: int = 1
+    viewed: ViewedParts, members: pa.Table, time: Span, every_ns: int = 1, more_km: float = 0.0
 ) -> tuple[pa.Table, Indices]:
     """Return the VIEWS of objects within a time, and the number of the object of each.
 
@@ -55,6 +57,8 @@ def gather_views(
         OBJECT_MEMBERS of the objects.
     every_ns
         Only epochs that are multiples of this time since midnight.
+    more_km
+        Error that is added to the positions of all sensors, 1-sigma per axis.
 
     Notes
     -----
@@ -72,7 +76,7 @@ def gather_views(
             rows, number = _rows(views, parts.read(span, "tracklets"), members_of_sensor, time)
             kept = array(views, "epoch")[rows] % DAY_NS % every_ns == 0
             rows, number = rows[kept], number[kept]
-            tables.append(views.take(rows))
+            tables.append(with_position_error(views.take(rows), more_km))
             numbers.append(number)
             sensors.append(np.full(len(number), sensor[0]))
     views = concat(VIEWS, tables)
@@ -168,28 +172,29 @@ def solve_piece(
     if not is_written(part):
         members = solved.objects.read(piece.span, "members")
         members = members.filter(pa.compute.field("piece") == piece.number)
-        views = unpack_views(*gather_views(viewed, members, piece.span.widened(margin_ns)))
+        time = piece.span.widened(margin_ns)
+        views = unpack_views(*gather_views(viewed, members, time, more_km=solved.more_km))
         errors = solved.errors.read(piece.span, "errors")
         groups = solve_positions(
             with_larger_errors(views, errors), positions.reject_sigma, piece.span
         )
-        write_part(part, SOLVED, _tables(groups, errors, sampling, positions.all_pairs, states))
+        stated = with_stated_errors(groups.views, errors, solved.more_km)
+        tables = _tables(groups, stated, sampling, positions.all_pairs, states)
+        write_part(part, SOLVED, tables)
     return read_part(part, "positions").num_rows
 
 
 def _tables(
     groups: ViewGroups,
-    errors: pa.Table,
+    stated: ObjectViews,
     sampling: LineSampling,
     all_pairs: bool,
     states: StateSettings,
 ) -> dict[str, pa.Table]:
-    """Return the tables of a solved piece."""
+    """Return the tables of a solved piece; `stated` are its views with the stated errors."""
     positions, associations = position_table(groups), association_table(groups)
     fitting, misfits = refuse_misfits(fit_states(groups, states))
     objects = moving_objects(positions, sampling.every_ns)
-    # The check of the sensors compares the lines with the errors that the sensors state.
-    stated = groups._replace(views=with_stated_errors(groups.views, errors))
     return {
         "associations": associations,
         "positions": positions,
@@ -197,7 +202,8 @@ def _tables(
         "states": fitting,
         "rejects": concat(REJECTS, [reject_table(groups), misfits]),
         "outcomes": view_outcomes(associations),
-        "lines": sample_sight_lines(stated, objects, sampling),
+        # The check of the sensors compares the lines with the errors that the sensors state.
+        "lines": sample_sight_lines(groups._replace(views=stated), objects, sampling),
         "object_views": object_views(groups.views, objects),
         "objects": objects,
     }
@@ -232,7 +238,8 @@ def judge_span(
     if solved.errors.holds(span):
         return
     members = sample_objects(solved.objects.read(span, "members"), max_views)
-    gathered = gather_views(viewed, members, span.widened(margin_ns), every_ns)
+    time = span.widened(margin_ns)
+    gathered = gather_views(viewed, members, time, every_ns, solved.more_km)
     views = unpack_views(*gathered)
     groups = solve_positions(views, positions.reject_sigma, span)
     # Directions as fitted, not corrected: the motion that the fits neglect is in their noise.

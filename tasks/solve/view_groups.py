@@ -81,6 +81,15 @@ class ObjectViews(NamedTuple):
         )
 
 
+def with_position_error(views: pa.Table, more_km: float) -> pa.Table:
+    """Return VIEWS with an error added to the positions of sensors, 1-sigma per axis [km]."""
+    if not more_km:
+        return views
+    at = views.schema.get_field_index("position_sigma_km")
+    sigma_km = pa.array(np.hypot(array(views, "position_sigma_km"), more_km))
+    return views.set_column(at, views.schema.field(at), sigma_km)
+
+
 def unpack_views(views: pa.Table, object_number: Indices) -> ObjectViews:
     """Return VIEWS as arrays, each with the number of its object."""
     sensor, sensor_ids = factorize(views, "sensor_id")
@@ -110,9 +119,14 @@ def with_larger_errors(views: ObjectViews, errors: pa.Table) -> ObjectViews:
     return _scaled(views, errors, 1.0)
 
 
-def with_stated_errors(views: ObjectViews, errors: pa.Table) -> ObjectViews:
-    """Return views with the shared errors that the sensors state: undo `with_larger_errors`."""
-    return _scaled(views, errors, -1.0)
+def with_stated_errors(views: ObjectViews, errors: pa.Table, more_km: float = 0.0) -> ObjectViews:
+    """Return views with the errors that the sensors state.
+
+    Undo `with_larger_errors`, and `with_position_error`.
+    """
+    stated = _scaled(views, errors, -1.0)
+    left = np.maximum(stated.sigma_km**2 - more_km**2, 0.0)
+    return stated._replace(sigma_km=np.sqrt(left)) if more_km else stated
 
 
 def _scaled(views: ObjectViews, errors: pa.Table, power: float) -> ObjectViews:

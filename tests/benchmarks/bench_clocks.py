@@ -39,7 +39,7 @@ def main() -> None:
             estimates.clear()
             summary, *_ = run(late)
             name = f"sat{k % 4 + 1}"
-            for clock in estimates[0]:
+            for clock in estimates[0].verdicts:
                 true = offset_s if clock.sensor_id == name else 0.0
                 scores.append((clock.offset_s - true) / clock.sigma_s)
                 if clock.sensor_id == name:

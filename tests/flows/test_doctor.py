@@ -3,10 +3,11 @@
 import json
 
 import pytest
-from scenes.log_mistakes import MISTAKES, rewritten
+from scenes.log_mistakes import MISTAKES, rewritten, starts_of_exposures
 
 from epipole.flows.command_line.main import app
 from epipole.flows.doctor import NOT_SHOWN, as_dict, doctor, lines
+from epipole.flows.evaluate import evaluate
 from epipole.flows.nightly import nightly
 from epipole.io.datasets.dataset import night_reader, read_table
 from epipole.io.logs.reader import read_log
@@ -85,3 +86,19 @@ def test_a_run_names_the_reading_that_makes_lines_of_sight_meet(prefect, night_l
     assert mistake.startswith(f"{', '.join(names)}: ")
     assert "with the states' axes exchanged or negated" in mistake
     assert summary.positions == 0
+
+
+def test_the_start_of_exposures_is_named_and_positions_carry_the_doubt(
+    prefect, night_log, tmp_path
+):
+    log = read_log(night_log)
+    wrong = rewritten(starts_of_exposures(1.0)(log, ["sat1", "sat2", "sat3", "sat4"]),
+                      tmp_path / "wrong.mcap")  # fmt: skip
+    assert doctor([str(wrong)]).mistakes == []
+    summary = nightly([str(wrong)], str(tmp_path / "out"))
+    (mistake,) = summary.mistakes
+    assert mistake.startswith("sat1, sat2, sat3, sat4: times of frames are -0.49")
+    assert mistake.endswith("write the middle of the exposure")
+    assert summary.verdicts == {"sensors_in_doubt": 9}
+    # Without the doubt, none of the positions is within its ellipsoid.
+    assert evaluate(tmp_path / "out", night_log).nees_in_99 > 0.95

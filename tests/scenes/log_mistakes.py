@@ -85,6 +85,14 @@ def cut(every):
     return lambda log, names: frames(log, names, time=pl.col("time").dt.truncate(every))
 
 
+def starts_of_exposures(exposure_s):
+    """Return a mistake: times are those of the start of exposures of this length."""
+    half = pl.duration(microseconds=round(exposure_s / 2 * 1e6))
+    return lambda log, names: frames(
+        log, names, time=pl.col("time") - half, exposure_s=pl.lit(exposure_s)
+    )
+
+
 def turned(back, label):
     """Return a mistake: positions turned to Earth-fixed axes, or (`back`) from them, labelled so.
 

@@ -20,6 +20,7 @@ IMAGE_SIZE = "image_size"
 FLUX = "flux"
 LEFT_OUT_STATES = "left_out_states"
 LINES_OF_SIGHT = "lines_of_sight"
+SENSORS_AGREE = "sensors_agree"
 UTC_TIMES = "utc_times"
 
 

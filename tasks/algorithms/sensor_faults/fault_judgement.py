@@ -9,7 +9,10 @@ Clock errors of sensors that look the same way cannot be separated, and a wrong 
 attitude may look like a wrong clock. So sets of faults of all sensors are compared by their
 evidence, with a penalty for each fault: most sensors are sound. A fault is declared if it is in all
 of the best sets. If these agree on the sensor but not on the kind of its fault, the sensor
-disagrees.
+disagrees. If they do not agree on the sensor either, all that may be at fault disagree, provided
+that more sensors are left; else somebody is wrong, and nobody knows who (`Doubt`).
+
+An offset that all clocks share counts as one fault. It moves all sensors along their orbits.
 """
 
 import itertools
@@ -34,7 +37,8 @@ FAULT_RAD = 600 * ARCSEC  # 1-sigma prior of a wrong attitude, per axis
 MIN_LOG_ODDS = 12.5  # minimum log odds of a fault: five sigma
 CLOCK_PRIOR_LOG_ODDS = 5.0  # prior log odds of a wrong clock against another fault
 DISTINCT_LOG_ODDS = 5.0  # minimum log odds of a set of faults against another set
-MAX_SETS = 1100  # maximum number of sets that are all compared; with more, a stepwise search
+MAX_SETS = 2200  # maximum number of sets that are all compared; with more, a stepwise search
+LEAST_AGREEING = 3  # sensors that have to agree where others do not
 OUTLIER_CHI2 = 20.0  # largest chi-square (2 degrees of freedom) of a line of the object
 ITERATIONS = 4  # of the fit, each about the last offsets and without outliers
 # Minimum number of objects from which anything is concluded about a sensor: of those that agree on
@@ -43,6 +47,9 @@ ITERATIONS = 4  # of the fit, each about the last offsets and without outliers
 MIN_OBJECTS = 3
 PER_SENSOR = 7  # offset, bias of position (3), bias of attitude (3)
 SOUND, CLOCK, EPHEMERIS, ATTITUDE, DISAGREES = "", "clock", "ephemeris", "attitude", "disagrees"
+ALL, SHARED = -1, "shared clock"  # the fault of all clocks together
+# Errors of ephemerides that are tried for all sensors alike, per axis [km].
+SPREADS_KM = np.geomspace(0.01, 30.0, 25)
 COLUMNS = {CLOCK: slice(0, 1), EPHEMERIS: slice(1, 4), ATTITUDE: slice(4, 7)}
 
 Faults = frozenset[tuple[int, str]]  # a sensor and its fault
@@ -76,6 +83,26 @@ class Lines(NamedTuple):
     v_sensor_km_s: Array
 
 
+class Doubt(NamedTuple):
+    """What is wrong with sensors of which none can be named.
+
+    undecided : bool
+        Some sensors are at fault, and several sets of them explain the lines as well.
+    spread_km, spread_log_odds : float
+        The likeliest error of an ephemeris, per axis, if all sensors have one; and its odds against
+        the stated errors. The odds are 0 if the fault of a sensor is declared.
+    shared_s, shared_sigma_s : float
+        The offset that all clocks share against the states, and its 1-sigma error. NaN if no such
+        offset is declared.
+    """
+
+    undecided: bool = False
+    spread_km: float = 0.0
+    spread_log_odds: float = 0.0
+    shared_s: float = np.nan
+    shared_sigma_s: float = np.nan
+
+
 class JudgedSensors(NamedTuple):
     """Clock offsets of sensors (reported minus true time), and their faults.
 
@@ -88,6 +115,8 @@ class JudgedSensors(NamedTuple):
         `SOUND` without a fault.
     size, size_sigma : (s,) float
         Size of a wrong ephemeris [km] or attitude [rad], and its 1-sigma error; else 0.
+    doubt
+        What is wrong without a name.
     """
 
     offset_s: Array
@@ -95,6 +124,7 @@ class JudgedSensors(NamedTuple):
     cause: list[str]
     size: Array
     size_sigma: Array
+    doubt: Doubt = Doubt()
 
     @property
     def wrong(self) -> Flags:
@@ -135,16 +165,25 @@ def judge_sensors(
         about = shift_lines(lines, guess)
         normal, right = _equations(about, kept, prior_sigma)
         model = Model(normal, right, guess / PRIOR_S, prior_sigma)
-        explained = _explain(model, np.flatnonzero(has_lines), attitude_sigma_rad > 0)
+        explained = _explain(
+            model,
+            np.flatnonzero(has_lines),
+            attitude_sigma_rad > 0,
+            bool((lines.sensor >= 0).all()),
+        )
         wrong = np.array([(s, CLOCK) in explained.faults for s in range(n_sensors)])
+        wrong |= (ALL, SHARED) in explained.faults
         unknowns = model.estimate(explained.faults)[0]
         step_s = unknowns[::PER_SENSOR][wrong] * PRIOR_S
-        good = _chi2(about, kept, prior_sigma, unknowns) < OUTLIER_CHI2
+        # The lines of faults that are not sure are no outliers: they would hide these.
+        explaining = model.estimate(explained.best)[0]
+        good = _chi2(about, kept, prior_sigma, explaining) < OUTLIER_CHI2
         guess[wrong] += step_s
         if (good == kept).all() and (np.abs(step_s) < 1e-4).all():
             break
         kept = good
-    return _judged(model, explained, has_lines)
+    judged = _judged(model, explained, has_lines)
+    return judged._replace(doubt=_doubt(model, explained, has_lines))
 
 
 def prior_sigmas(position_sigma_km: Array, attitude_sigma_rad: Array) -> Array:
@@ -185,6 +224,22 @@ class Model:
         A, b, constant = self._with_prior(faults)
         return float(b @ np.linalg.solve(A, b) - np.linalg.slogdet(A)[1]) / 2 + constant
 
+    def spread(self) -> tuple[float, float]:
+        """Return the likeliest 1-sigma error of all ephemerides, per axis [km], and its log odds.
+
+        They are against the errors that the sensors state.
+        """
+        evidence = []
+        for spread_km in SPREADS_KM:
+            weight = self._weights(frozenset())
+            columns = COLUMNS[EPHEMERIS]
+            weight[:, columns] = np.minimum((self.prior_sigma[:, columns] / spread_km) ** 2, 1.0)
+            A, b = self.normal + np.diag(weight.ravel()), self.right - (weight * self.guess).ravel()
+            fit = float(b @ np.linalg.solve(A, b) - np.linalg.slogdet(A)[1])
+            evidence.append(fit + float(np.log(weight).sum() - np.sum(weight * self.guess**2)))
+        best = int(np.argmax(evidence))
+        return float(SPREADS_KM[best]), evidence[best] / 2 - self.evidence(frozenset())
+
     def size(self, sensor: int, cause: str, faults: Faults) -> tuple[float, float]:
         """Return the size of a wrong ephemeris [km] or attitude [rad], and its sigma."""
         x, cov = self.estimate(faults)
@@ -196,43 +251,62 @@ class Model:
         return length, float(np.sqrt(along @ cov[np.ix_(columns, columns)] @ along))
 
     def _with_prior(self, faults: Faults) -> tuple[Array, Array, float]:
+        weight = self._weights(faults)
+        pull = weight * self.guess
+        constant = np.log(weight).sum()
+        prior = np.diag(weight.ravel())
+        if (ALL, SHARED) in faults:
+            # One error more, that all clocks share: by the formula of Sherman and Morrison.
+            clocks, total = weight[:, 0], 1.0 + weight[:, 0].sum()
+            pull[:, 0] -= clocks * pull[:, 0].sum() / total
+            prior[::PER_SENSOR, ::PER_SENSOR] -= np.outer(clocks, clocks) / total
+            constant -= np.log(total)
+        constant -= np.sum(pull * self.guess)
+        return self.normal + prior, self.right - pull.ravel(), float(constant) / 2
+
+    def _weights(self, faults: Faults) -> Array:
+        """Return the inverse prior variances of the unknowns, without a shared offset."""
         weight = np.ones_like(self.prior_sigma)
         weight[:, 0] = (PRIOR_S / SOUND_S) ** 2
-        for s, cause in faults:
+        for s, cause in faults - {(ALL, SHARED)}:
             usual = {CLOCK: PRIOR_S, EPHEMERIS: FAULT_KM, ATTITUDE: FAULT_RAD}[cause]
             weight[s, COLUMNS[cause]] = (self.prior_sigma[s, COLUMNS[cause]] / usual) ** 2
-        pull = weight * self.guess
-        constant = np.log(weight).sum() - np.sum(pull * self.guess)
-        right = self.right - pull.ravel()
-        return self.normal + np.diag(weight.ravel()), right, float(constant) / 2
+        return weight
 
 
 class _Explanation(NamedTuple):
     """Declared faults, sensors with a fault of unknown kind, and whether the best set is distinct.
 
-    It is distinct if no other set of faults has nearly the same score.
+    It is distinct if no other set of faults has nearly the same score. It is `undecided` who is at
+    fault if sensors of the `best` set are not in all of these, and few others are left.
     """
 
     faults: Faults
     disagreeing: list[int]
     distinct: bool
+    undecided: bool
+    best: Faults
 
 
-def _explain(model: Model, sensors: Indices, has_prior_attitude: Flags) -> _Explanation:
+def _explain(
+    model: Model, sensors: Indices, has_prior_attitude: Flags, are_all: bool
+) -> _Explanation:
     """Return the faults that are in the best set and in all sets of nearly the same score.
 
     The score is the log evidence minus a penalty for each fault. An attitude can be wrong only
-    where `has_prior_attitude`.
+    where `has_prior_attitude`. Clocks can share an offset only if these `are_all` sensors.
     """
     score: dict[Faults, float] = {}
     kinds = [
         [(s, kind) for kind in COLUMNS if kind != ATTITUDE or has_prior_attitude[s]]
         for s in sensors.tolist()
     ]
+    if are_all:
+        kinds.append([(ALL, SHARED)])
 
     def judge(faults: Faults) -> float:
         if faults not in score:
-            rarer = sum(kind != CLOCK for _, kind in faults)
+            rarer = sum(kind not in (CLOCK, SHARED) for _, kind in faults)
             score[faults] = (
                 model.evidence(faults) - MIN_LOG_ODDS * len(faults) - CLOCK_PRIOR_LOG_ODDS * rarer
             )
@@ -251,9 +325,21 @@ def _explain(model: Model, sensors: Indices, has_prior_attitude: Flags) -> _Expl
                 break
             best = better
     good = [faults for faults, value in score.items() if value > score[best] - DISTINCT_LOG_ODDS]
+    return _conclude(best, good, len(sensors))
+
+
+def _conclude(best: Faults, good: list[Faults], n_sensors: int) -> _Explanation:
+    """Return what the best set of faults and those of nearly the same score have in common."""
     sure = best.intersection(*good)
-    at_fault = {s for s, _ in best}.intersection(*({s for s, _ in faults} for faults in good))
-    return _Explanation(sure, sorted(at_fault - {s for s, _ in sure}), len(good) == 1)
+    sets = [{s for s, _ in faults} for faults in good]
+    at_fault = {s for s, _ in best}.intersection(*sets)
+    disputed = set().union(*sets) - at_fault
+    unsure = {s for s, _ in best} != at_fault
+    wrong = at_fault | disputed if unsure else at_fault
+    few_left = n_sensors - len(wrong) < max(len(wrong) + 1, LEAST_AGREEING)
+    undecided = unsure and (few_left or ALL in disputed)
+    disagreeing = sorted((at_fault if undecided else wrong) - {s for s, _ in sure} - {ALL})
+    return _Explanation(sure, disagreeing, len(good) == 1, undecided, best)
 
 
 def _neighbouring_sets(faults: Faults, kinds: list[list[tuple[int, str]]]) -> list[Faults]:
@@ -275,6 +361,7 @@ def _judged(model: Model, explained: _Explanation, has_lines: Flags) -> JudgedSe
     """Return each sensor's offset, with its clock and the declared faults free, and its fault."""
     n = len(has_lines)
     faults = explained.faults
+    shared = faults & {(ALL, SHARED)}
     offset, sigma = np.full(n, np.nan), np.full(n, np.nan)
     size, size_sigma = np.zeros(n), np.zeros(n)
     cause = [SOUND] * n
@@ -285,13 +372,31 @@ def _judged(model: Model, explained: _Explanation, has_lines: Flags) -> JudgedSe
         at = PER_SENSOR * s
         offset[s] = (model.guess[s, 0] + step[at]) * PRIOR_S
         sigma[s] = np.sqrt(cov[at, at]) * PRIOR_S
-    for s, kind in faults:
+    for s, kind in faults - shared:
         cause[s] = kind
         if kind != CLOCK:
             size[s], size_sigma[s] = model.size(s, kind, faults)
     for s in explained.disagreeing:
         cause[s] = DISAGREES
     return JudgedSensors(offset, sigma, cause, size, size_sigma)
+
+
+def _doubt(model: Model, explained: _Explanation, has_lines: Flags) -> Doubt:
+    """Return what is wrong without a name."""
+    spread_km, log_odds = model.spread()
+    unnamed = not (explained.faults or explained.disagreeing)
+    found = Doubt(explained.undecided, spread_km, log_odds if unnamed else 0.0)
+    if (ALL, SHARED) not in explained.faults:
+        return found
+    if explained.disagreeing or any(kind not in (CLOCK, SHARED) for _, kind in explained.faults):
+        # Two errors of ephemerides may look like one and a shared offset.
+        return found._replace(undecided=True)
+    step, cov = model.estimate(explained.faults)
+    clocks = PER_SENSOR * np.flatnonzero(has_lines)
+    shared = model.guess[has_lines, 0] + step[clocks]
+    middle = int(np.argmin(np.diag(cov)[clocks]))
+    sigma = float(np.sqrt(cov[clocks[middle], clocks[middle]]))
+    return found._replace(shared_s=float(shared[middle]) * PRIOR_S, shared_sigma_s=sigma * PRIOR_S)
 
 
 def shift_lines(lines: Lines, offset_s: Array) -> Lines:

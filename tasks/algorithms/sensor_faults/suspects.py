@@ -24,6 +24,7 @@ from epipole.tasks.algorithms.sensor_faults.fault_judgement import (
     PER_SENSOR,
     PRIOR_S,
     SOUND,
+    Doubt,
     JudgedSensors,
     Lines,
     Model,
@@ -52,8 +53,11 @@ def judge_many_sensors(
     n_sensors = len(position_sigma_km)
     if n_sensors <= MAX_TOGETHER:
         return judge_sensors(lines, position_sigma_km, attitude_sigma_rad, guess_s)
+    doubt = _doubt_of_most(lines, position_sigma_km, attitude_sigma_rad)
     prior_sigma = prior_sigmas(position_sigma_km, attitude_sigma_rad)
-    found = _nothing_known(n_sensors)
+    found = _nothing_known(n_sensors)._replace(doubt=doubt)
+    if np.isfinite(doubt.shared_s):
+        return found
     faulty = np.zeros(n_sensors, bool)
     for _ in range(MAX_ROUNDS):
         left = _of_other_sensors(lines, faulty)
@@ -77,6 +81,17 @@ def judge_many_sensors(
             break
         faulty[newly] = True
     return found
+
+
+def _doubt_of_most(lines: Lines, position_sigma_km: Array, attitude_sigma_rad: Array) -> Doubt:
+    """Return what is wrong without a name, by the sensors with most lines alone."""
+    count = np.bincount(lines.sensor, minlength=len(position_sigma_km))
+    most = np.sort(np.argsort(-count, kind="stable")[:MAX_TOGETHER])
+    others = np.ones(len(count), bool)
+    others[most] = False
+    among = _of_other_sensors(lines, others)
+    among = among._replace(sensor=np.searchsorted(most, among.sensor))
+    return judge_sensors(among, position_sigma_km[most], attitude_sigma_rad[most]).doubt
 
 
 class _Equations(NamedTuple):

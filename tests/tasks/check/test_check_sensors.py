@@ -9,6 +9,7 @@ from epipole.schemas.spans import SPAN_NS, Sensor, Span
 from epipole.schemas.tables import POSITIONS
 from epipole.schemas.work_tables import CLOCK_LINES, VIEWS
 from epipole.tasks.check.check_sensors import (
+    JudgedSights,
     SensorVerdict,
     add_corrections,
     check_sensors,
@@ -37,14 +38,14 @@ def test_without_views_no_clock_is_known():
     groups = solve_positions(views, reject_sigma=5.0)
     lines = sample_sight_lines(groups, objects, LineSampling(1))
     assert lines.equals(empty(CLOCK_LINES))
-    assert sensor_verdicts(to_polars(lines)) == []
-    assert sensor_verdicts(to_polars(lines), {"a": 0.5}) == []
+    assert sensor_verdicts(to_polars(lines)) == JudgedSights([])
+    assert sensor_verdicts(to_polars(lines), {"a": 0.5}) == JudgedSights([])
 
 
 def test_without_objects_no_clock_is_known(tmp_path):
     solved, spans = SolvedParts(tmp_path), [Span(k * SPAN_NS, (k + 1) * SPAN_NS) for k in (7, 8)]
     sensors = ViewedParts(tmp_path / "views"), [Sensor(0, "a")]
-    assert check_sensors.fn(solved, *sensors, spans) == []
+    assert check_sensors.fn(solved, *sensors, spans) == JudgedSights([])
     tables = {name: empty(schema) for name, schema in SOLVED.items()}
     write_part(solved.piece(spans[1], 0), SOLVED, tables)
-    assert check_sensors.fn(solved, *sensors, spans) == []
+    assert check_sensors.fn(solved, *sensors, spans) == JudgedSights([])

@@ -85,6 +85,13 @@ def test_the_first_verdict_that_is_true_counts(seen, positions, misfit, verdict)
     assert each["o"]["verdict"] == verdict
 
 
+def test_in_a_night_in_doubt_objects_with_positions_are_in_doubt():
+    checks = filled("checks", sensor_id=["a"], check=["sensors_agree"], verdict=["wrong"])
+    each = found([observed("o"), observed("p")], [solved("o")], ["o", "p"], checks=checks)
+    assert each["o"]["verdict"] == ObjectVerdict.SENSORS_IN_DOUBT
+    assert each["p"]["verdict"] == ObjectVerdict.SOUND
+
+
 def test_the_amplitude_is_that_of_the_light_curve_beyond_its_noise():
     n, noise = 4000, 0.2
     rng = np.random.default_rng(1)

@@ -102,6 +102,6 @@ def test_shared_errors_are_as_large_as_the_objects_show():
         sensor_id=pl.Series(["a", "b"]), bias_sigma_arcsec=2.0, position_sigma_km=0.1
     )
     errors = pl.DataFrame({"sensor_id": ["b"], "direction": [9.0], "position": [4.0]})
-    found = with_shared_errors(seen, errors)
+    found = with_shared_errors(seen, errors, 0.0)
     assert found["bias_sigma_arcsec"].to_list() == [2.0, 6.0]
     assert found["position_sigma_km"].to_list() == [0.1, 0.2]

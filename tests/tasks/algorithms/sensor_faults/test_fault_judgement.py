@@ -97,3 +97,28 @@ def test_a_wrong_clock_is_not_mistaken_for_an_ephemeris():
     for seed in range(5):
         judged = solve(lines_of(seed, (0.0, 0.0, 0.3, 0.0), n_epochs=150))
         assert judged.cause == [SOUND, SOUND, CLOCK, SOUND]
+
+
+def test_an_offset_that_all_clocks_share_is_found():
+    for true_s in (-0.5, 0.05):
+        found = solve(lines_of(1, np.full(4, true_s), n_epochs=20))
+        assert found.cause == [SOUND] * 4
+        assert abs(found.doubt.shared_s - true_s) < 4 * found.doubt.shared_sigma_s < 0.03
+
+
+def test_sound_sensors_leave_no_doubt():
+    for seed in range(5):
+        doubt = solve(lines_of(seed, np.zeros(4), n_epochs=20)).doubt
+        assert not doubt.undecided
+        assert np.isnan(doubt.shared_s)
+        assert doubt.spread_log_odds < 3.0
+
+
+def test_it_is_undecided_which_half_is_wrong():
+    bias_km = np.array([[0.3], [0.3], [POSITION_KM], [POSITION_KM]])
+    found = solve(lines_of(1, np.zeros(4), bias_km=bias_km, n_epochs=20))
+    assert found.cause == [SOUND] * 4
+    assert found.doubt.undecided
+    assert found.doubt.spread_log_odds > 6.0
+    # Two of four are off by 0.3 km per axis; what all share does not show.
+    assert 0.05 < found.doubt.spread_km < 0.3

@@ -8,6 +8,7 @@ from scenes.tracklet_scenes import GEO, Scene, solve
 from epipole.tasks.algorithms.association.samples import FREE, Groups
 from epipole.tasks.algorithms.sensor_faults.fault_judgement import (
     CLOCK,
+    DISAGREES,
     EPHEMERIS,
     SOUND,
     judge_sensors,
@@ -42,6 +43,16 @@ def test_the_faults_of_many_are_those_that_all_together_have():
     apart = np.abs(many.offset_s - together.offset_s)
     assert (apart < 0.5 * together.sigma_s).all()
     assert abs(many.offset_s[3] - 0.3) < 4 * many.sigma_s[3]
+
+
+def test_two_of_many_of_which_one_is_wrong_disagree_both():
+    lines = lines_of_many(4, 8, 400, off_km={1: 8.0})
+    # These two see objects with each other alone.
+    pair = np.isin(lines.sensor, [0, 1])
+    kept = np.where(lines.group % 2 == 0, pair, ~pair)
+    found = judged(lines._replace(**{n: getattr(lines, n)[kept] for n in lines._fields}), 8)
+    assert faults(found) == {0: DISAGREES, 1: DISAGREES}
+    assert not found.doubt.undecided
 
 
 @pytest.mark.long

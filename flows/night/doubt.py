@@ -1,0 +1,112 @@
+"""Doubt: what is solved where sensors disagree, and who is wrong is not clear.
+
+Sensors that agree with each other may be those that are wrong. So where no more sensors agree than
+not, or several sets of faults explain the lines of sight as well, no sensor is left out: the
+positions of all sensors get an error as large as the disagreement shows, and the night is solved
+with it. Its positions have the covariances of such errors.
+"""
+
+import logging
+from typing import NamedTuple
+
+import numpy as np
+import pyarrow.compute as pc
+
+from epipole.flows.night.stages import Checked, check, solve
+from epipole.flows.night.summary import many
+from epipole.flows.night.work import Work
+from epipole.io.work.work_layout import SolvedParts
+from epipole.schemas.rejects import Reason
+from epipole.schemas.settings import Settings
+from epipole.tasks.algorithms.sensor_faults.fault_judgement import LEAST_AGREEING, SOUND, Doubt
+from epipole.tasks.check.check_sensors import SensorVerdict
+
+LOGGER = logging.getLogger(__name__)
+
+WIDE_KM = 10.0  # error with which all sensors take part, to learn how far they disagree
+# The spread is that about the mean of all sensors. If half of them have the same error, their mean
+# is off by as much. With 1, half of the positions lay outside their 99 % ellipsoids then; with 2
+# and 3, none.
+MARGIN = 2.0
+# Of errors larger than stated, which are nobody's in particular. Sound scenes have up to 1.4.
+MIN_LOG_ODDS = 6.0
+
+
+class Settled(NamedTuple):
+    """A night that is solved, and what is wrong without a name; None where nothing is.
+
+    `clocks` are those that are wrong, be they corrected or not.
+    """
+
+    work: Work
+    solved: SolvedParts
+    doubt: Doubt | None = None
+    clocks: tuple[SensorVerdict, ...] = ()
+
+
+def settle(work: Work, solved: SolvedParts, checked: Checked, settings: Settings) -> Settled:
+    """Solve a night again where sensors are at fault, or in doubt.
+
+    Parameters
+    ----------
+    work
+        As it was before the check.
+    """
+    if not in_doubt(checked.work, solved, checked):
+        if checked.left_out:
+            solved = solve(work, settings, checked.left_out)
+        return Settled(checked.work, solved, clocks=_clocks(checked.work))
+    wide = solve(work, settings, more_km=WIDE_KM)
+    judged = check(work, wide, settings, correct=False)
+    clocks = _clocks(judged.work)
+    if judged.left_out and not in_doubt(judged.work, wide, judged):
+        solved = solve(work, settings, judged.left_out)
+        if not in_doubt(judged.work, solved, judged):
+            return Settled(judged.work, solved, clocks=clocks)
+    more_km = MARGIN * max(checked.doubt.spread_km, judged.doubt.spread_km)
+    LOGGER.warning(
+        "sensors disagree, and who is wrong is not clear: an error of %.2g km per axis is added "
+        "to the positions of all %s", more_km, many(len(work.spans), "sensor"),
+    )  # fmt: skip
+    unnamed = tuple(one._replace(cause=SOUND) for one in judged.work.verdicts)
+    solved = solve(work, settings, more_km=more_km)
+    return Settled(judged.work._replace(verdicts=unnamed), solved, judged.doubt, clocks)
+
+
+def _clocks(work: Work) -> tuple[SensorVerdict, ...]:
+    """Return the verdicts on clocks that are wrong."""
+    return tuple(one for one in work.verdicts if one.has_wrong_clock)
+
+
+def in_doubt(work: Work, solved: SolvedParts, checked: Checked) -> bool:
+    """Return whether it is not clear which sensors are wrong.
+
+    A clock is wrong against the states of the same sensor: it needs no others that agree.
+    """
+    doubt = checked.doubt
+    if doubt.undecided or np.isfinite(doubt.shared_s) or doubt.spread_log_odds > MIN_LOG_ODDS:
+        return True
+    agree, disagree = _sides(work, solved)
+    faulty = {name for name, why in checked.left_out.items() if why != Reason.CLOCK_OFF}
+    agree, disagree = agree - set(checked.left_out), disagree | faulty
+    return bool(disagree) and len(agree) < max(len(disagree) + 1, LEAST_AGREEING)
+
+
+def _sides(work: Work, solved: SolvedParts) -> tuple[set[str], set[str]]:
+    """Return the sensors that have objects with others, and those mostly left out at that."""
+    names = {sensor.number: sensor.sensor_id for sensor in work.spans}
+    joined, left_out = dict.fromkeys(names.values(), 0), dict.fromkeys(names.values(), 0)
+    for span in work.all_spans():
+        if not solved.holds(span):
+            continue
+        members = solved.objects.read(span, "members", ["sensor"])["sensor"]
+        for pair in pc.value_counts(members).to_pylist():
+            joined[names[pair["values"]]] += pair["counts"]
+        for rows in solved.of_blocks(span, "rejects"):
+            rows = rows.filter(pc.equal(rows["reason"], Reason.SENSOR_DISAGREES.value))
+            for name, count in zip(
+                rows["sensor_id"].to_pylist(), rows["count"].to_pylist(), strict=True
+            ):
+                left_out[name] += count
+    disagree = {name for name, count in left_out.items() if count > joined[name]}
+    return {name for name, count in joined.items() if count} - disagree, disagree
