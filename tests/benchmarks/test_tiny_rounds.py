@@ -53,7 +53,7 @@ TINY = {
     "tracking": "--frames 20 --objects 10 --false 2 --repeats 1",
     "unlike_frames": "--cameras a --kinds shaken errors --frames 8",
     "unknown_cameras": "--frames 1 --told 1.02 --fields 12",
-    "untold_optics": "--tiny",
+    "untold_optics": "--tiny --place drawn",
 }
 # Rounds with other tools, of packages that CI does not install.
 WITH_PACKAGES = {

@@ -21,12 +21,16 @@ Array = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int64]
 
 BLEND_PX = 2.5  # separation below which two images blend, if there are too few pairs to measure it
-BIN_PX = 0.25  # width of the bins of separation
-RESOLVED_SHARE = 0.25  # images blend where less than this share of the expected pairs is found
-MIN_PAIRS = 100  # minimum number of pairs of detections for that measurement
-MAX_PREDICTED_S = 60.0  # longest time over which a tracklet is predicted beyond its ends
+# How that separation is measured: width of the bins, share of the expected pairs below which images
+# blend, and minimum number of pairs. With half the bins, or twice the share, some separations
+# in the tests come out wrong; with 50 to 200 pairs none does.
+BIN_PX, RESOLVED_SHARE, MIN_PAIRS = 0.25, 0.25, 100
+# Longest time over which a tracklet is predicted beyond its ends; half and double fail tests.
+MAX_PREDICTED_S = 60.0
 MIN_FLUX_SHARE = 0.5  # share of the usual flux below which a blend is the neighbour alone
-MIN_COEXISTING = 3  # minimum number of detections of each tracklet in the time of both
+# Minimum number of detections of each tracklet in the time of both: 1 to 6 make no difference in
+# the tests; fewer than three may be false detections.
+MIN_COEXISTING = 3
 
 
 class TrackedDetections(NamedTuple):

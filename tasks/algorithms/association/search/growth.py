@@ -34,8 +34,10 @@ Array = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int64]
 Flags = npt.NDArray[np.bool_]
 
-MIN_LOOKS = 3  # minimum number of other sensors with the points in their field, to give up a seed
-GIVE_UP_LOG_ODDS = -4.0  # log-odds of the other sensors below which a seed is given up
+# A seed is given up if the log-odds of the other sensors are below the first, and the second number
+# of them at least has its points in the field. With one sensor, or -2, small scenes of
+# bench_association come out with other odds; with six, or -8, they do not.
+GIVE_UP_LOG_ODDS, MIN_LOOKS = -4.0, 3
 MIN_GAIN = 2.0  # minimum log-odds that a view adds to a well-known point, to join it
 MIN_LEAD = 5.0  # minimum difference of the log-odds of a sensor's best view and the next one
 MIN_REVIEWED = 4  # minimum number of views of a hypothesis that is reviewed
