@@ -68,6 +68,8 @@ def _with_share(
     for piece in reader.pieces(name, columns):
         rows = piece.with_row_index("row", first).filter(pl.col("object_id").is_not_null())
         first += len(piece)
+        if rows.is_empty():
+            continue
         for each in rows["object_id"].unique():
             share_of[each] = zlib.crc32(each.encode()) % shares
         share = pl.col("object_id").replace_strict(share_of, return_dtype=pl.Int64)

@@ -88,6 +88,16 @@ def made(folder, shares=1):
     return read_columns(folder, "orbits", ORBITS.names), rejects
 
 
+def test_rows_without_an_object_come_first(tmp_path):
+    seen = observed("high", GEO)
+    written(tmp_path, [seen], [state("high", GEO)])
+    nobody = seen.with_columns(object_id=pl.lit(None, pl.String))
+    write_table(tmp_path, "observations", [
+        rows.to_arrow().cast(OBSERVATIONS) for rows in (nobody, seen)
+    ])  # fmt: skip
+    assert made(tmp_path)[0]["object_id"].to_pylist() == ["high"]
+
+
 def test_objects_have_an_orbit_from_states_or_positions(tmp_path):
     low = np.linspace(-60.0, 60.0, 25)
     seen = [observed("high", GEO), observed("low", LOW, times_s=low)]
