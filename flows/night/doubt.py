@@ -28,6 +28,9 @@ WIDE_KM = 10.0  # error with which all sensors take part, to learn how far they 
 # is off by as much. With 1, half of the positions lay outside their 99 % ellipsoids then; with 2
 # and 3, none.
 MARGIN = 2.0
+# Of low satellites. What all clocks share shifts sensors alongside each other alike, and objects:
+# their lines of sight show a part of it.
+SPEED_KM_S = 7.6
 # Of errors larger than stated, which are nobody's in particular. Sound scenes have up to 1.4.
 MIN_LOG_ODDS = 6.0
 
@@ -63,7 +66,7 @@ def settle(work: Work, solved: SolvedParts, checked: Checked, settings: Settings
         solved = solve(work, settings, judged.left_out)
         if not in_doubt(judged.work, solved, judged):
             return Settled(judged.work, solved, clocks=clocks)
-    more_km = MARGIN * max(checked.doubt.spread_km, judged.doubt.spread_km)
+    more_km = _error_km(checked.doubt, judged.doubt)
     LOGGER.warning(
         "sensors disagree, and who is wrong is not clear: an error of %.2g km per axis is added "
         "to the positions of all %s", more_km, many(len(work.spans), "sensor"),
@@ -71,6 +74,13 @@ def settle(work: Work, solved: SolvedParts, checked: Checked, settings: Settings
     unnamed = tuple(one._replace(cause=SOUND) for one in judged.work.verdicts)
     solved = solve(work, settings, more_km=more_km)
     return Settled(judged.work._replace(verdicts=unnamed), solved, judged.doubt, clocks)
+
+
+def _error_km(*doubts: Doubt) -> float:
+    """Return the error of the positions of all sensors that the disagreement shows."""
+    shared = [abs(each.shared_s) for each in doubts if np.isfinite(each.shared_s)]
+    moved_km = SPEED_KM_S * max(shared, default=0.0)
+    return max(MARGIN * max(each.spread_km for each in doubts), moved_km)
 
 
 def _clocks(work: Work) -> tuple[SensorVerdict, ...]:
