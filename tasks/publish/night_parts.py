@@ -72,23 +72,32 @@ def in_slices(
 
     Notes
     -----
-    The times depend on the number of rows and tables only.
+    The slices depend on the times of the rows and the number of tables only. They have about as
+    many rows each, wherever in the span these lie; rows of one time are never divided.
     """
     times = [array(read(), column).copy() for read in tables]
     orders = [None if (np.diff(t) >= 0).all() else np.argsort(t, kind="stable") for t in times]
-    limit = max(MAX_ROWS, ROWS_OF_TABLE * len(tables))
-    count = max(-(-sum(len(t) for t in times) // limit), 1)
-    edges = np.linspace(span.start_ns, span.end_ns, count + 1).astype(np.int64)
+    edges = _edges(times, span, max(MAX_ROWS, ROWS_OF_TABLE * len(tables)))
     cuts = [
         np.searchsorted(t if order is None else t[order], edges)
         for t, order in zip(times, orders, strict=True)
     ]
     del times
-    for k in range(count):
+    for k in range(len(edges) - 1):
         yield [
             _rows(read, order, int(cut[k]), int(cut[k + 1]))
             for read, order, cut in zip(tables, orders, cuts, strict=True)
         ]
+
+
+def _edges(times: Sequence[npt.NDArray[np.int64]], span: Span, limit: int) -> npt.NDArray[np.int64]:
+    """Return the times that bound slices of a span, with at most about `limit` rows each."""
+    together = np.concatenate([np.zeros(0, np.int64), *times])
+    inside = together[(together >= span.start_ns) & (together < span.end_ns)]
+    count = -(-len(inside) // limit)
+    middle = np.arange(1, count) * len(inside) // max(count, 1)
+    between = np.unique(np.partition(inside, middle)[middle]) if count > 1 else middle
+    return np.array([span.start_ns, *between[between > span.start_ns], span.end_ns], np.int64)
 
 
 def _rows(

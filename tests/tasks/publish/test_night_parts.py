@@ -47,3 +47,21 @@ def test_a_table_in_another_order_is_sorted():
 def test_no_rows_are_one_empty_slice():
     assert [rows[0].num_rows for rows in in_slices([epochs], SPAN, "epoch")] == [0]
     assert list(in_slices([], SPAN, "epoch")) == [[]]
+
+
+def test_rows_of_a_small_part_of_a_span_are_divided_too(monkeypatch):
+    monkeypatch.setattr(time_slices, "MAX_ROWS", 100)
+    monkeypatch.setattr(time_slices, "ROWS_OF_TABLE", 1)
+    wide = Span(0, 1_000_000)
+    times = np.random.default_rng(0).integers(5_000, 6_000, 1_000).tolist()
+    sizes = [rows[0].num_rows for rows in in_slices([partial(epochs, *times)], wide, "epoch")]
+    assert sum(sizes) == 1_000
+    assert max(sizes) < 120
+
+
+def test_rows_of_one_time_are_never_divided(monkeypatch):
+    monkeypatch.setattr(time_slices, "MAX_ROWS", 2)
+    monkeypatch.setattr(time_slices, "ROWS_OF_TABLE", 1)
+    read = partial(epochs, *[11] * 7, *[15] * 7)
+    cut = [rows[0]["frame_number"].to_pylist() for rows in in_slices([read], Span(10, 20), "epoch")]
+    assert [each for each in cut if each] == [[11] * 7, [15] * 7]
