@@ -12,7 +12,7 @@ from prefect import flow
 
 from epipole.flows.night.calibrating import calibrate, find_cameras
 from epipole.flows.night.doubt import settle
-from epipole.flows.night.log_checks import check_logs, check_readings
+from epipole.flows.night.log_checks import check_logs, check_readings, wrong_velocities
 from epipole.flows.night.log_choice import LastNights, Night, find_logs, night_asked, run_name
 from epipole.flows.night.recorded_nights import (
     EarlierNights,
@@ -269,7 +269,7 @@ def make_night(
     its sensors are there: `usual` are those of nights before.
     """
     checks = check_logs(frames, night, usual, settings)
-    spans, uncalibrated = plan_spans(frames, night)
+    spans, left_out = plan_spans(frames, night, wrong_velocities(checks))
     work = identify(frames, spans, folder, settings)
     work, stated = find_cameras(work, settings)
     work, calibrations = calibrate(work, stated, settings)
@@ -283,7 +283,7 @@ def make_night(
     settled = settle(work, solved, checked, settings)
     checks = check_readings(settled, frames, checks)
     tables = {"checks": checks, "calibrations": calibrations}
-    return MadeNight(settled.work, settled.solved, tables, uncalibrated)
+    return MadeNight(settled.work, settled.solved, tables, left_out)
 
 
 def choose_nights(

@@ -206,6 +206,12 @@ class Reason(StrEnum):
         "The state's attitude_sigma_arcsec is above 2 degrees, too vague to help; its position is "
         "used.",
     )
+    WRONG_VELOCITY = (
+        "wrong_velocity",
+        Stage.READ,
+        "The sensor's velocities contradict the path of its positions, as `checks` says; they are "
+        "read as unknown.",
+    )
     DUPLICATE_STATE = (
         "duplicate_state",
         Stage.READ,

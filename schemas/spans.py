@@ -65,10 +65,14 @@ ALL_TIME = Span(-(2**63), 2**63 - 1)
 
 
 class Sensor(NamedTuple):
-    """A sensor: its number in the run, which names its parts, and its id."""
+    """A sensor: its number in the run, which names its parts, and its id.
+
+    `has_velocities` is false where those of its states are not used.
+    """
 
     number: int
     sensor_id: str
+    has_velocities: bool = True
 
     def __str__(self) -> str:
         """Return the sensor's id."""

@@ -11,7 +11,7 @@ from epipole.flows.night.progress import results
 from epipole.io.datasets.rows_by_night import rows_of_night
 from epipole.io.work.parts import read_part
 from epipole.schemas.bridge import array, concat
-from epipole.schemas.log_checks import mistakes
+from epipole.schemas.log_checks import CheckVerdict, LogCheck, mistakes
 from epipole.schemas.settings import Settings
 from epipole.schemas.spans import DAY_NS, SPAN_NS, day_of
 from epipole.schemas.stages import Stage
@@ -66,6 +66,15 @@ def check_logs(
     return _with_warnings(concat(CHECKS, [*results(Stage.READ, futures), absent]))
 
 
+def wrong_velocities(checks: pa.Table) -> set[str]:
+    """Return the sensors whose velocities contradict the path of their positions."""
+    return {
+        row["sensor_id"]
+        for row in checks.select(["sensor_id", "check", "verdict"]).to_pylist()
+        if row["check"] == LogCheck.VELOCITY and row["verdict"] == CheckVerdict.WRONG
+    }
+
+
 def check_readings(settled: Settled, frames: OrderedFrames, checks: pa.Table) -> pa.Table:
     """Return CHECKS with what the lines of sight of a night say of the sensors' states."""
     work, doubt = settled.work, settled.doubt
@@ -74,7 +83,7 @@ def check_readings(settled: Settled, frames: OrderedFrames, checks: pa.Table) ->
     judged = judge_readings.submit(viewed, list(work.spans), work.all_spans())
     (found,) = results(Stage.CHECK, [judged])
     if doubt is not None:
-        exposure_s = {name: _exposure_s(frames, number) for number, name in work.spans}
+        exposure_s = {name: _exposure_s(frames, number) for number, name, _ in work.spans}
         found = concat(CHECKS, [found, doubt_table(doubt, settled.solved.more_km, exposure_s)])
     return concat(CHECKS, [checks, _with_warnings(found)])
 

@@ -1,6 +1,6 @@
 """The work of a night: its sensors, their spans with frames, and where their parts are."""
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from typing import NamedTuple, TypeVar
 
 import pyarrow as pa
@@ -17,7 +17,7 @@ from epipole.tasks.calibrate.calibrate_sensors import SensorStars
 from epipole.tasks.check.check_sensors import SensorVerdict
 from epipole.tasks.common.batches import Batch, in_batches
 from epipole.tasks.identify.identify_span import SpanToIdentify
-from epipole.tasks.read.order_frames import OrderedFrames, SpanFrames
+from epipole.tasks.read.order_frames import OrderedFrames, SpanFrames, states_between
 from epipole.tasks.track.join_tracklets import SensorToJoin
 from epipole.tasks.track.track_span import SpanToTrack
 
@@ -73,10 +73,13 @@ class Work(NamedTuple):
         }
 
 
-def plan_spans(frames: OrderedFrames, night: str) -> tuple[Spans, pa.Table]:
+def plan_spans(
+    frames: OrderedFrames, night: str, without_velocity: Collection[str] = ()
+) -> tuple[Spans, pa.Table]:
     """Return the spans with frames, by sensor: of a night, and one before and after it.
 
-    A sensor without a calibration has no spans, but a row of the `rejects` that are returned.
+    A sensor without a calibration has no spans, but a row of the `rejects` that are returned, and
+    so have sensors whose velocities are not used.
 
     Raises
     ------
@@ -90,7 +93,10 @@ def plan_spans(frames: OrderedFrames, night: str) -> tuple[Spans, pa.Table]:
     for number, (sensor_id, found) in enumerate(zip(frames.sensors, frames.spans, strict=True)):
         wanted = [each.span for each in found if _is_wanted(each.span, day)]
         if wanted and sensor_id in calibrated:
-            spans[Sensor(number, sensor_id)] = wanted
+            has_velocities = sensor_id not in without_velocity
+            spans[Sensor(number, sensor_id, has_velocities)] = wanted
+            if not has_velocities:
+                rejects.append(_without_velocity(frames.folder, number, sensor_id, day))
         elif of_day := [each for each in found if each.span.start_ns // DAY_NS == day]:
             rejects.append(_without_calibration(sensor_id, of_day))
     if not spans:
@@ -118,6 +124,17 @@ def _without_calibration(sensor_id: str, of_day: Sequence[SpanFrames]) -> pa.Tab
         sensor_id=sensor_id,
         time=[of_day[0].first_ns],
         count=[sum(each.n_frames for each in of_day)],
+    )
+
+
+def _without_velocity(folder: ReadFolder, number: int, sensor_id: str, day: int) -> pa.Table:
+    states = states_between(folder, number, day * DAY_NS, (day + 1) * DAY_NS)
+    first = states.slice(0, 1)
+    return reject_rows(
+        Reason.WRONG_VELOCITY,
+        sensor_id=[sensor_id] * first.num_rows,
+        time=first["time"],
+        count=[states.num_rows] * first.num_rows,
     )
 
 

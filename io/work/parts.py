@@ -230,5 +230,8 @@ class Parts(NamedTuple):
 
         A frame whose clock was corrected may lie in the part of a neighbouring span.
         """
-        others = [other for other in spans_between(*span.widened(CLOCK_NS)) if self.holds(other)]
-        return concat(schema, [span.of(self.read(other, name), time) for other in others])
+        return concat(schema, [span.of(self.read(near, name), time) for near in self.near(span)])
+
+    def near(self, span: Span) -> list[Span]:
+        """Return the spans with a part that may have rows of this one."""
+        return [near for near in spans_between(*span.widened(CLOCK_NS)) if self.holds(near)]

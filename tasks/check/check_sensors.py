@@ -130,7 +130,7 @@ def check_sensors(
     )
     nothing = pl.DataFrame(OBJECT_VIEWS.empty_table())
     first_guess, of_objects = {}, [lines]
-    for number, name in sensors:
+    for number, name, _ in sensors:
         assigned = views_of_objects.get((name,), nothing)
         match = _search_clock(_candidate_pairs(viewed[number], spans, assigned, objects))
         if match is not None:

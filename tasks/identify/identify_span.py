@@ -19,6 +19,7 @@ from epipole.tasks.common.batches import Batch
 from epipole.tasks.common.stage_tasks import stage_task
 from epipole.tasks.identify.frame_inputs import interpolate_sensor_states
 from epipole.tasks.identify.identify_stars import identify_stars
+from epipole.tasks.read.assume_readings import without_velocities
 from epipole.tasks.read.order_frames import frames_between, states_between
 
 LOGGER = logging.getLogger(__name__)
@@ -107,7 +108,8 @@ def _counts(parts: Parts, span: Span) -> Counts:
 def states_about(frames: ReadFolder, sensor: Sensor, span: Span, state_gap_s: float) -> pa.Table:
     """Return the states of a sensor that are needed for its frames of a span."""
     reach_ns = BRIDGED_NS + round(state_gap_s * 1e9)
-    return states_between(frames, sensor.number, *span.widened(reach_ns))
+    states = states_between(frames, sensor.number, *span.widened(reach_ns))
+    return states if sensor.has_velocities else without_velocities(states)
 
 
 def _without_state(frame_states: pa.Table) -> pa.Table:

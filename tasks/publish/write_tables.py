@@ -1,6 +1,6 @@
 """Write tables: the parts of a night's spans, joined to the tables of a dataset."""
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from functools import partial
 from importlib.metadata import version
 from pathlib import Path
@@ -12,7 +12,7 @@ import pyarrow.compute as pc
 
 from epipole.io.datasets.night_tables import write_table
 from epipole.io.datasets.rows_by_night import in_order, rows_of_night
-from epipole.io.work.parts import read_part
+from epipole.io.work.parts import Parts, read_part
 from epipole.schemas.bridge import array, concat, conform, from_polars, table, to_polars
 from epipole.schemas.rejects import Outcome, Reason, Trait, reject_rows
 from epipole.schemas.settings import Settings, TableSettings
@@ -121,9 +121,20 @@ def _identified(name: str, parts: NightParts) -> Iterator[list[pa.Table]]:
     column = "solutions" if name == "frames" else name
     schema = SOLUTIONS if name == "frames" else TABLES[name]
     for span in parts.spans:
-        tables = [partial(of.identified.rows_within, span, schema, column) for of in parts.sensors]
+        tables = [_reader(of.identified, span, schema, column) for of in parts.sensors]
         for rows in in_slices(tables, span, "time"):
             yield [conform(TABLES[name], of_sensor) for of_sensor in rows]
+
+
+def _reader(parts: Parts, span: Span, schema: pa.Schema, name: str) -> Callable[[], pa.Table]:
+    """Return what reads a table of one sensor with all rows of a span.
+
+    A single part is only mapped into memory: a slice copies the few rows that it needs.
+    """
+    near = parts.near(span)
+    if len(near) == 1:
+        return partial(parts.read, near[0], name)
+    return partial(parts.rows_within, span, schema, name)
 
 
 def _detections(parts: NightParts) -> Iterator[list[pa.Table]]:

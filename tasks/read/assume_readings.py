@@ -78,9 +78,15 @@ def _with_states(states: pa.Table, assumed: Assumption) -> pa.Table:
     if assumed.states != "as stated":
         frame = np.where(of_sensor, assumed.states, array(states, "frame"))
         states = _with_column(states, "frame", pa.array(frame.tolist(), pa.string()))
-    for name in VELOCITIES if assumed.velocities == "unknown" else ():
+    return without_velocities(states, of_sensor) if assumed.velocities == "unknown" else states
+
+
+def without_velocities(states: pa.Table, rows: npt.NDArray[np.bool_] | None = None) -> pa.Table:
+    """Return states of which those of some rows, or all, have no velocity."""
+    of_rows = np.ones(states.num_rows, bool) if rows is None else rows
+    for name in VELOCITIES:
         values = states[name].to_numpy().astype(float)
-        unknown = of_sensor | np.isnan(values)
+        unknown = of_rows | np.isnan(values)
         states = _with_column(states, name, pa.array(values, mask=unknown))
     return states
 

@@ -66,6 +66,10 @@ def test_a_run_writes_the_same_checks_and_shows_mistakes(prefect, wrong_log, tmp
     assert f"mistake     {summary.mistakes[0]}" in summary.lines()
     assert f"needs a look: {summary.mistakes[0]}" in summary.sentence()
     assert summary.mistakes[0] in caplog.messages
+    rejects = read_table(str(tmp_path / "out"), "rejects", NIGHT).to_pylist()
+    (unused,) = [row for row in rejects if row["reason"] == "wrong_velocity"]
+    assert unused["sensor_id"] == "sat2"
+    assert unused["count"] > 20
     facts = read_night_facts(night_reader(str(tmp_path / "out"), NIGHT), "out")
     assert needs_look(facts)[0].sentence == summary.mistakes[0]
 

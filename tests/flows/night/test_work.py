@@ -6,9 +6,11 @@ import numpy as np
 import pyarrow as pa
 import pytest
 
+from epipole.flows.night import work
 from epipole.flows.night.work import Work, count_frames, plan_spans
 from epipole.io.work.work_layout import ReadFolder, WorkFolder
 from epipole.schemas.bridge import empty
+from epipole.schemas.columns import TIME
 from epipole.schemas.errors import LogError
 from epipole.schemas.rejects import Reason, reject_rows
 from epipole.schemas.spans import DAY_NS, SPAN_NS
@@ -54,6 +56,15 @@ def test_a_sensor_without_calibration_has_a_reject_and_no_spans():
     assert row == {
         "sensor_id": "a", "stage": "identify", "reason": "no_calibration", "count": 2,
     }  # fmt: skip
+
+
+def test_a_sensor_whose_velocities_are_wrong_is_used_without_them(monkeypatch):
+    states = pa.table({"time": pa.array([MIDNIGHT_NS, MIDNIGHT_NS + 1]).cast(TIME)})
+    monkeypatch.setattr(work, "states_between", lambda *_: states)
+    spans, rejects = plan_spans(frames(["a", "b"], a=[1.0], b=[1.0]), NIGHT, {"b"})
+    assert {sensor.sensor_id: sensor.has_velocities for sensor in spans} == {"a": True, "b": False}
+    (row,) = rejects.select(["sensor_id", "reason", "count"]).to_pylist()
+    assert row == {"sensor_id": "b", "reason": "wrong_velocity", "count": 2}
 
 
 def test_no_calibration_at_all_is_an_error_that_says_what_to_do():

@@ -11,7 +11,12 @@ from epipole.schemas.bridge import array
 from epipole.schemas.errors import SettingsError
 from epipole.schemas.given_settings import with_assumptions
 from epipole.schemas.settings import Assumption, Settings
-from epipole.tasks.read.assume_readings import VELOCITIES, as_assumed, as_assumed_source
+from epipole.tasks.read.assume_readings import (
+    VELOCITIES,
+    as_assumed,
+    as_assumed_source,
+    without_velocities,
+)
 
 EXAMPLE = Path(__file__).parents[3] / "examples" / "four_sensor_geo.mcap"
 SENSORS = ("sat1", "sat2", "sat3", "sat4")
@@ -109,3 +114,9 @@ def test_assumptions_of_a_command_join_those_of_the_settings():
 def test_an_assumption_that_means_nothing_is_refused(text, says):
     with pytest.raises(SettingsError, match=says):
         with_assumptions(Settings(), [text])
+
+
+def test_states_without_velocities_keep_everything_else(piece):
+    states = without_velocities(piece.states)
+    assert all(states[name].null_count == states.num_rows for name in VELOCITIES)
+    assert states.drop_columns(list(VELOCITIES)).equals(piece.states.drop_columns(list(VELOCITIES)))
