@@ -227,7 +227,8 @@ class Model:
     def spread(self) -> tuple[float, float]:
         """Return the likeliest 1-sigma error of all ephemerides, per axis [km], and its log odds.
 
-        They are against the errors that the sensors state.
+        They are against the errors that the sensors state. Where the largest error that is tried is
+        the likeliest, it is none of ephemerides, such as where optics are uncertain: 0, 0.
         """
         evidence = []
         for spread_km in SPREADS_KM:
@@ -238,6 +239,8 @@ class Model:
             fit = float(b @ np.linalg.solve(A, b) - np.linalg.slogdet(A)[1])
             evidence.append(fit + float(np.log(weight).sum() - np.sum(weight * self.guess**2)))
         best = int(np.argmax(evidence))
+        if best == len(SPREADS_KM) - 1:
+            return 0.0, 0.0
         return float(SPREADS_KM[best]), evidence[best] / 2 - self.evidence(frozenset())
 
     def size(self, sensor: int, cause: str, faults: Faults) -> tuple[float, float]:
