@@ -227,8 +227,8 @@ class Model:
     def spread(self) -> tuple[float, float]:
         """Return the likeliest 1-sigma error of all ephemerides, per axis [km], and its log odds.
 
-        They are against the errors that the sensors state. Where the largest error that is tried is
-        the likeliest, it is none of ephemerides, such as where optics are uncertain: 0, 0.
+        They are against the errors that the sensors state. Both are 0 where the largest error that
+        is tried is the likeliest: something else is wrong then, such as uncertain optics.
         """
         evidence = []
         for spread_km in SPREADS_KM:
