@@ -72,12 +72,7 @@ def _later_frames(t_s: Array, row: int) -> Iterator[int]:
 
 def _groups_between(centroids: RawCentroids, row: int, later: int) -> Iterator[Rows]:
     """Yield the groups of a frame that move to a later one, ascending."""
-    one = slice(
-        centroids.first[row], min(centroids.first[row + 1], centroids.first[row] + BRIGHTEST)
-    )
-    two = slice(
-        centroids.first[later], min(centroids.first[later + 1], centroids.first[later] + BRIGHTEST)
-    )
+    one, two = (_brightest(centroids, frame) for frame in (row, later))
     u, v = centroids.u[one], centroids.u[two]
     if min(len(u), len(v)) < MIN_GROUP:
         return
@@ -88,6 +83,12 @@ def _groups_between(centroids: RawCentroids, row: int, later: int) -> Iterator[R
     for group in groups_that_move(u, v, reach, tolerance):
         if len(group) <= MAX_SHARE * len(u):
             yield group
+
+
+def _brightest(centroids: RawCentroids, row: int) -> slice:
+    """Return which centroids of a frame take part."""
+    first, last = centroids.first[row : row + 2]
+    return slice(first, min(last, first + BRIGHTEST))
 
 
 def groups_that_move(u: Array, v: Array, reach: float, tolerance: float) -> Iterator[Rows]:
