@@ -83,7 +83,7 @@ def check_readings(settled: Settled, frames: OrderedFrames, checks: pa.Table) ->
     judged = judge_readings.submit(viewed, list(work.spans), work.all_spans())
     (found,) = results(Stage.CHECK, [judged])
     if doubt is not None:
-        exposure_s = {name: _exposure_s(frames, number) for number, name, _ in work.spans}
+        exposure_s = {each.sensor_id: _exposure_s(frames, each.number) for each in work.spans}
         found = concat(CHECKS, [found, doubt_table(doubt, settled.solved.more_km, exposure_s)])
     return concat(CHECKS, [checks, _with_warnings(found)])
 

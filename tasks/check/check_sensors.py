@@ -130,9 +130,10 @@ def check_sensors(
     )
     nothing = pl.DataFrame(OBJECT_VIEWS.empty_table())
     first_guess, of_objects = {}, [lines]
-    for number, name, _ in sensors:
+    for sensor in sensors:
+        name = sensor.sensor_id
         assigned = views_of_objects.get((name,), nothing)
-        match = _search_clock(_candidate_pairs(viewed[number], spans, assigned, objects))
+        match = _search_clock(_candidate_pairs(viewed[sensor.number], spans, assigned, objects))
         if match is not None:
             first_guess[name], matched = match
             of_objects.append(matched.join(lines, on=KEY, how="anti"))

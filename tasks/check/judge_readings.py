@@ -61,7 +61,7 @@ def _sampled(viewed: ViewedParts, sensors: Sequence[Sensor], span: Span) -> Iter
     """Yield VIEWS of some epochs at which at least two sensors have views."""
     columns = {
         number: array(viewed[number].read(span, "views", ["epoch"]), "epoch")
-        for number, *_ in sensors
+        for number in (sensor.number for sensor in sensors)
         if viewed[number].holds(span)
     }
     every = [np.unique(epoch_ns, return_counts=True) for epoch_ns in columns.values()]
