@@ -143,19 +143,26 @@ def _variance_by_flux(residual: Array, flux: Array) -> tuple[float, float]:
         return UNKNOWN_STAR_MAG2, 0.0
     n_bins = int(np.clip(len(residual) // MIN_PER_BIN, 1, MAX_BINS))
     order = np.argsort(flux, kind="stable")
-    of_bin = np.array_split(order, n_bins)
-    variance = np.array([(GAUSSIAN * np.median(np.abs(residual[b]))) ** 2 for b in of_bin])
+    variance = (GAUSSIAN * _medians_of_parts(np.abs(residual[order]), n_bins)) ** 2
     variance = np.maximum(variance, MIN_MAG2)
     if n_bins < 3:
         return float(np.mean(variance)), 0.0
     unit = np.median(flux)
-    typical = np.array([np.median(flux[b]) for b in of_bin]) / unit
+    typical = _medians_of_parts(flux[order], n_bins) / unit
     terms = np.stack([np.ones(n_bins), 1.0 / typical], axis=1)
     expected = variance
     for _ in range(ITERATIONS):  # weights by the measured variances alone would favour small ones
         (floor, photon), _ = nnls(terms / expected[:, None], variance / expected)
         expected = np.maximum(terms @ [floor, photon], MIN_MAG2)
     return max(float(floor), MIN_MAG2), float(photon * unit)
+
+
+def _medians_of_parts(values: Array, n_parts: int) -> Array:
+    """Return the medians of parts of about the same length, as of `numpy.array_split`."""
+    length, longer = divmod(len(values), n_parts)
+    head, tail = np.split(values, [longer * (length + 1)])
+    rows = head.reshape(longer, length + 1), tail.reshape(n_parts - longer, length)
+    return np.concatenate([np.median(part, axis=1) for part in rows])
 
 
 def _variance(model: tuple[float, float], flux: Array) -> Array:

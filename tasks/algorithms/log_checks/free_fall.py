@@ -11,6 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
+from numpy.polynomial.chebyshev import chebder, chebfit, chebint, chebval, chebvander
 
 from epipole.tasks.algorithms.constants import EARTH_RADIUS_KM, GM_KM3_S2, J2, SECOND_NS
 
@@ -30,6 +31,14 @@ OUTLIER = 10.0  # in units of the scatter
 # Errors of neighbouring states are correlated: as if an error of the size of the sigma bent the
 # whole arc, but at most that of ten times the scatter.
 BENT = 10.0
+
+
+# Values and slopes there of a Chebyshev series are products with its coefficients, and so is the
+# series of the integral with the values.
+_TAU = np.cos(np.pi * (np.arange(NODES) + 0.5) / NODES)
+_AT_NODES = chebvander(_TAU, NODES - 1)
+_SLOPE_AT_NODES = np.stack([chebval(_TAU, chebder(unit)) for unit in np.eye(NODES)], axis=1)
+_INTEGRAL = np.asarray(chebint(np.linalg.inv(_AT_NODES)))
 
 
 class Arc(NamedTuple):
@@ -121,8 +130,27 @@ def polynomial_residuals(arc: Arc) -> tuple[Array, float]:
     return residual, scatter
 
 
-def fall(arc: Arc, scale: float, rate_rad_s: Array) -> Fall:
-    """Return how an arc falls if its positions times `scale` are kilometres.
+class ReadArc(NamedTuple):
+    """An arc as a reading has it, in kilometres, and what gravity and the axes do along it.
+
+    tau : (n,) float
+        Time, -1 to 1 from the first to the last state, and half the time between them [s].
+    once, twice : (n, 3) float
+        Their acceleration, integrated once and twice over time [km/s, km].
+    """
+
+    tau: Array
+    half_s: float
+    r_km: Array
+    v_km_s: Array
+    sigma_km: float
+    gravity_km_s2: float
+    once: Array
+    twice: Array
+
+
+def read_arc(arc: Arc, scale: float, rate_rad_s: Array) -> ReadArc:
+    """Return an arc whose positions times `scale` are kilometres, in axes that turn.
 
     Parameters
     ----------
@@ -134,44 +162,48 @@ def fall(arc: Arc, scale: float, rate_rad_s: Array) -> Fall:
     tau = arc.t_s / half_s
     path, _ = _polynomial(tau, r, degree_of(len(tau)), np.ones(len(tau), bool))
     once, twice = _integrals(path, half_s, rate_rad_s)
+    gravity = float(np.linalg.norm(gravity_of(_values(path, np.zeros(1)))))
+    return ReadArc(
+        tau, half_s, r, arc.v, arc.sigma * scale, gravity, _values(once, tau), _values(twice, tau)
+    )  # fmt: skip
+
+
+def fall(read: ReadArc) -> Fall:
+    """Return how an arc falls by its positions."""
     # What remains of free fall is a straight line; its curve is the excess.
-    y = r - _values(twice, tau)
+    tau, half_s, y = read.tau, read.half_s, read.r_km - read.twice
     design = np.stack([np.ones_like(tau), tau, tau**2 / 2], axis=1)
     solution, *_ = np.linalg.lstsq(design, y, rcond=None)
     scatter = float(np.sqrt(((y - design @ solution) ** 2).sum() / (3 * max(len(tau) - 3, 1))))
     cov = np.linalg.inv(design.T @ design)
-    bent = min(arc.sigma * scale, BENT * scatter)
+    bent = min(read.sigma_km, BENT * scatter)
     excess = solution[2] / half_s**2
     sigma = np.hypot(scatter * np.sqrt(cov[2, 2]), 2 * bent) / half_s**2
-    v = _values(once, tau) + (solution[1] + solution[2] * tau[:, None]) / half_s
+    v = read.once + (solution[1] + solution[2] * tau[:, None]) / half_s
     return Fall(
         float(np.linalg.norm(excess)),
         float(sigma),
-        float(np.linalg.norm(gravity_of(_values(path, np.zeros(1))))),
+        read.gravity_km_s2,
         v,
         float(np.hypot(scatter * np.sqrt(cov[1, 1] + cov[2, 2] / 3), bent) / half_s),
     )
 
 
-def fall_of_velocities(arc: Arc, scale: float, rate_rad_s: Array) -> tuple[float, float]:
+def fall_of_velocities(read: ReadArc) -> tuple[float, float]:
     """Return the excess acceleration and its error [km/s^2], by the velocities [km/s].
 
     NaN and infinity where fewer than `MIN_STATES` have one.
     """
-    known = np.isfinite(arc.v[:, 0])
+    known = np.isfinite(read.v_km_s[:, 0])
     if known.sum() < MIN_STATES:
         return np.nan, np.inf
-    half_s = max(float(arc.t_s[-1] - arc.t_s[0]) / 2, 1e-6)
-    tau = arc.t_s / half_s
-    path, _ = _polynomial(tau, arc.r * scale, degree_of(len(tau)), np.ones(len(tau), bool))
-    once, _ = _integrals(path, half_s, rate_rad_s)
-    y = (arc.v - _values(once, tau))[known]
-    design = np.stack([np.ones_like(tau), tau], axis=1)[known]
+    y = (read.v_km_s - read.once)[known]
+    design = np.stack([np.ones_like(read.tau), read.tau], axis=1)[known]
     solution, *_ = np.linalg.lstsq(design, y, rcond=None)
     scatter = np.sqrt(((y - design @ solution) ** 2).sum() / (3 * max(len(y) - 2, 1)))
     cov = np.linalg.inv(design.T @ design)
-    sigma = scatter * np.hypot(np.sqrt(cov[1, 1]), 1.0) / half_s
-    return float(np.linalg.norm(solution[1]) / half_s), float(sigma)
+    sigma = scatter * np.hypot(np.sqrt(cov[1, 1]), 1.0) / read.half_s
+    return float(np.linalg.norm(solution[1]) / read.half_s), float(sigma)
 
 
 def gravity_of(r_km: Array) -> Array:
@@ -185,14 +217,13 @@ def gravity_of(r_km: Array) -> Array:
 
 def _integrals(path: Array, half_s: float, rate_rad_s: Array) -> tuple[Array, Array]:
     """Return the acceleration along a path, integrated once and twice over time."""
-    nodes = np.asarray(np.cos(np.pi * (np.arange(NODES) + 0.5) / NODES), np.float64)
-    r = _values(path, nodes)
-    v = _values(np.asarray(np.polynomial.chebyshev.chebder(path), np.float64), nodes) / half_s
-    w = rate_rad_s
-    acceleration = gravity_of(r) - 2 * np.cross(w, v) - np.cross(w, np.cross(w, r))
-    force = np.polynomial.chebyshev.chebfit(nodes, acceleration, NODES - 1)
-    once = np.asarray(np.polynomial.chebyshev.chebint(force) * half_s, np.float64)
-    return once, np.asarray(np.polynomial.chebyshev.chebint(once) * half_s, np.float64)
+    r = _AT_NODES[:, : len(path)] @ path
+    v = _SLOPE_AT_NODES[:, : len(path)] @ path / half_s
+    turned = np.cross(rate_rad_s, np.eye(3))  # the cross product w x r is r @ turned
+    acceleration = gravity_of(r) - 2 * v @ turned - r @ turned @ turned
+    once = _INTEGRAL @ acceleration * half_s
+    twice = np.asarray(chebint(once) * half_s, np.float64)
+    return once, twice
 
 
 def _polynomial(
@@ -200,10 +231,10 @@ def _polynomial(
 ) -> tuple[Array, Array]:
     """Return the Chebyshev coefficients of the best polynomial, and its values at all times."""
     width = max(float(np.abs(tau).max()), 1e-9)
-    fitted = np.polynomial.chebyshev.chebfit(tau[used] / width, r[used], degree)
+    fitted = chebfit(tau[used] / width, r[used], degree)
     path = np.asarray(fitted, np.float64)
     return path, _values(path, tau / width)
 
 
 def _values(coefficients: Array, tau: Array) -> Array:
-    return np.asarray(np.polynomial.chebyshev.chebval(tau, coefficients).T)
+    return np.asarray(chebval(tau, coefficients).T)

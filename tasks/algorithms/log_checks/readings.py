@@ -12,7 +12,13 @@ import numpy.typing as npt
 
 from epipole.tasks.algorithms.constants import EARTH_RADIUS_KM, EARTH_RATE_RAD_S
 from epipole.tasks.algorithms.earth_gravity import LOWEST_ORBIT_KM
-from epipole.tasks.algorithms.log_checks.free_fall import Arc, fall, fall_of_velocities
+from epipole.tasks.algorithms.log_checks.free_fall import (
+    Arc,
+    ReadArc,
+    fall,
+    fall_of_velocities,
+    read_arc,
+)
 
 Array = npt.NDArray[np.float64]
 
@@ -73,22 +79,31 @@ def all_readings(stated_rate: Array) -> list[Reading]:
     return [Reading(scale, rate) for scale in SCALES for rate in rates]
 
 
-def fit_reading(arcs: Sequence[Arc], reading: Reading, use_velocities: bool = False) -> ReadingFit:
+def read_arcs(arcs: Sequence[Arc], reading: Reading) -> list[ReadArc]:
+    """Return all arcs of a sensor as a reading has them."""
+    return [read_arc(arc, *reading) for arc in arcs]
+
+
+def fit_reading(
+    arcs: Sequence[ReadArc], reading: Reading, use_velocities: bool = False
+) -> ReadingFit:
     """Return how well a reading fits.
 
     Parameters
     ----------
+    arcs
+        As the reading has them.
     use_velocities
         Whether velocities are known to be those of the path: then the better of the two
         estimates counts.
     """
     rows = []
     for arc in arcs:
-        radius_km = float(np.median(np.linalg.norm(arc.r, axis=1))) * reading.scale
-        found = fall(arc, *reading)
+        radius_km = float(np.median(np.linalg.norm(arc.r_km, axis=1)))
+        found = fall(arc)
         excess, sigma = found.excess_km_s2, found.sigma_km_s2
         if use_velocities:
-            other, other_sigma = fall_of_velocities(arc, *reading)
+            other, other_sigma = fall_of_velocities(arc)
             if other_sigma < sigma:
                 excess, sigma = other, other_sigma
         allowed = MODEL_SHARE * found.gravity_km_s2 + MODEL_KM_S2 + SIGMAS * sigma

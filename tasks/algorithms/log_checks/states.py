@@ -34,6 +34,7 @@ from epipole.tasks.algorithms.log_checks.readings import (
     fit_reading,
     is_on_the_ground,
     main_readings,
+    read_arcs,
 )
 from epipole.tasks.algorithms.log_checks.velocities import check_velocities
 
@@ -100,21 +101,17 @@ def check_states(states: LogStates) -> list[Finding]:
 def _readings(arcs: Sequence[Arc], earth_fixed: bool) -> tuple[float, list[Finding]]:
     """Return the unit of positions [km], and the findings on unit, frame and velocities."""
     stated = EARTH_FIXED if earth_fixed else INERTIAL
-    fits = _fits(arcs, stated)
+    readings = [(reading, read_arcs(arcs, reading)) for reading in main_readings(stated)]
+    fits = [fit_reading(read, reading) for reading, read in readings]
+    if fits[0].misfit > FAR:
+        readings = [(reading, read_arcs(arcs, reading)) for reading in all_readings(stated)]
+        fits = [fit_reading(read, reading) for reading, read in readings]
     best = _chosen(fits)
-    velocity = check_velocities(arcs, best.reading)
+    velocity = check_velocities(*(read for r, read in readings if r is best.reading))
     if velocity.verdict == SOUND:
-        fits = _fits(arcs, stated, use_velocities=True)
+        fits = [fit_reading(read, reading, use_velocities=True) for reading, read in readings]
         best = _chosen(fits)
     return best.reading.scale, [_unit(fits, best), _frame(fits, best), velocity]
-
-
-def _fits(arcs: Sequence[Arc], stated: Array, use_velocities: bool = False) -> list[ReadingFit]:
-    """Return the fits of the readings, the stated one first: all where it does not fit."""
-    fits = [fit_reading(arcs, reading, use_velocities) for reading in main_readings(stated)]
-    if fits[0].misfit <= FAR:
-        return fits
-    return [fit_reading(arcs, reading, use_velocities) for reading in all_readings(stated)]
 
 
 def _chosen(fits: Sequence[ReadingFit]) -> ReadingFit:

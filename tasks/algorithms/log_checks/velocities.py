@@ -14,8 +14,8 @@ from epipole.tasks.algorithms.log_checks.findings import (
     WRONG,
     Finding,
 )
-from epipole.tasks.algorithms.log_checks.free_fall import Arc, fall
-from epipole.tasks.algorithms.log_checks.readings import EARTH_FIXED, Reading
+from epipole.tasks.algorithms.log_checks.free_fall import ReadArc, fall
+from epipole.tasks.algorithms.log_checks.readings import EARTH_FIXED
 
 Array = npt.NDArray[np.float64]
 
@@ -27,15 +27,9 @@ CLEARLY = 0.1  # what another meaning leaves of the difference
 LARGE_SHARE = 0.1  # of the speed: another velocity, and not a poor one
 
 
-def check_velocities(arcs: Sequence[Arc], reading: Reading) -> Finding:
-    """Return whether velocities are those of the path.
-
-    Parameters
-    ----------
-    reading
-        How the positions are meant.
-    """
-    path, stated, r, allowed = _compared(arcs, reading)
+def check_velocities(arcs: Sequence[ReadArc]) -> Finding:
+    """Return whether velocities are those of the path, of arcs as the positions are meant."""
+    path, stated, r, allowed = _compared(arcs)
     if not len(stated):
         return Finding(VELOCITY, UNKNOWN, cause="no_velocities")
     off = _median_length(stated - path)
@@ -56,17 +50,17 @@ def check_velocities(arcs: Sequence[Arc], reading: Reading) -> Finding:
     )
 
 
-def _compared(arcs: Sequence[Arc], reading: Reading) -> tuple[Array, Array, Array, float]:
+def _compared(arcs: Sequence[ReadArc]) -> tuple[Array, Array, Array, float]:
     """Return velocities of the path, stated ones, positions [km], and the allowed difference."""
     path, stated, r, allowed = [], [], [], []
     for arc in arcs:
-        known = np.isfinite(arc.v[:, 0])
+        known = np.isfinite(arc.v_km_s[:, 0])
         if not known.any():
             continue
-        found = fall(arc, *reading)
+        found = fall(arc)
         path.append(found.v_km_s[known])
-        stated.append(arc.v[known])
-        r.append(arc.r[known] * reading.scale)
+        stated.append(arc.v_km_s[known])
+        r.append(arc.r_km[known])
         noise = np.diff(stated[-1] - path[-1], axis=0)
         sigma = found.v_sigma_km_s + (_median_length(noise) if len(noise) else 0.0)
         allowed.append(SIGMAS * sigma + MODEL_SHARE * _orbital_speed(r[-1]))

@@ -4,8 +4,8 @@ What the passes learn of the sensor is a `SensorModel`: its centroid error, its 
 zero point of its brightness.
 
 1. Probe (`_probe`): some scattered frames are searched, with one assumption after the other, until
-   any is identified. Groups of centroids that move together (`moving_groups`) are searched first in
-   crowds, last elsewhere.
+   any is identified. Groups of centroids that move together (`moving_groups`) are searched first
+   where the first frames are a crowd, last elsewhere.
 2. Sample (`_learn_around`): the model is learned from frames around the identified ones.
 3. All frames (`identify_sample`): followed from frame to frame, searched where that fails.
 4. All frames again (`_identify_again`): only if the probe failed and pass 3 identified some. The
@@ -63,6 +63,8 @@ MIN_CENTROIDS = 4  # of a frame that takes part in the probe and the sample
 # centroids, so most are no stars.
 PROBED, PROBED_CROWDED, CROWDED = 5, 8, 100
 MANY = 40  # centroids of a typical frame, of which most may be satellites
+# Frames that show whether they are; what that may cost of the searches' budget.
+FIRST, FIRST_SHARE = 2, 0.05
 # The number of stars in a crowded field is unknown: the first number is assumed, then a sky that is
 # deeper by the second.
 STARS_IN_CROWD, DEEPER_IN_CROWD_MAG = 25.0, 1.5
@@ -206,7 +208,7 @@ def _probe(
     rows = usable[aperiodic_rows(len(usable), PROBED_CROWDED if crowded else PROBED)]
     scales = KNOWN_SCALES if stated else UNKNOWN_SCALES_PX
     # The groups of a crowd are searched sooner than its frames; most other frames need none.
-    if typical > MANY:
+    if typical > MANY and not _are_stars(frames.take(rows[:FIRST]), skies, first, scales[0]):
         frames = _anchored_by_motion(frames, rows, skies, first, scales)
     model, solutions = _first_scale(frames.take(rows), skies, first, scales, crowded)
     if typical <= MANY and not any(solutions):
@@ -215,6 +217,13 @@ def _probe(
             frames = anchored
             model, solutions = _first_scale(frames.take(rows), skies, first, scales, crowded)
     return frames, model, _Probe(rows, solutions, usable)
+
+
+def _are_stars(frames: FrameSample, skies: Skies, model: SensorModel, scale: float) -> bool:
+    """Return whether all of some frames are identified at once: they are no crowd."""
+    quick = model.matching._replace(time_limit_s=model.matching.time_limit_s / 4, crowded=False)
+    tried = model._replace(scale=scale, matching=quick)
+    return bool(identify_sample(frames, skies, tried, share=FIRST_SHARE)[0].solved.all())
 
 
 def _assumed_limit(centroids: RawCentroids, typical: float, crowded: bool, skies: Skies) -> float:
