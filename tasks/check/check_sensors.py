@@ -213,9 +213,9 @@ def sensor_verdicts(
     if not len(rows):
         return JudgedSights([])
     # A quantile: blends in a few tracklets are not an error of the attitude.
-    spread = (pl.col("cov_bias_11_rad2") + pl.col("cov_bias_22_rad2")) / 2
     bias = rows.group_by("sensor_id").agg(
-        pl.col("position_sigma_km").max(), attitude_sigma_rad=spread.quantile(0.9).sqrt()
+        pl.col("position_sigma_km").max(),
+        attitude_sigma_rad=pl.col("attitude_rad2").quantile(0.9).sqrt(),
     ).sort("sensor_id")  # fmt: skip
     judged = judge_many_sensors(
         _lines(rows, bias["sensor_id"]),
@@ -260,12 +260,26 @@ def _lines(rows: pl.DataFrame, sensors: pl.Series) -> Lines:
         group=rows.select(pl.struct("epoch", "object_id").rle_id()).to_series().to_numpy(),
         sensor=np.asarray(sensors.search_sorted(rows["sensor_id"]), np.int64),
         u=stack(rows, "u{}"),
-        cov=_direction_cov(rows, "noise"),
+        cov=_direction_cov(rows, "noise") + _error_of_parts(rows),
         x_km=stack(rows, "{}_km"),
         v_km_s=stack(rows, "v{}_km_s"),
         r_km=stack(rows, "sensor_{}_km"),
         v_sensor_km_s=stack(rows, "sensor_v{}_km_s"),
     )
+
+
+def _error_of_parts(rows: pl.DataFrame) -> Array:
+    """Return what all lines in a part of a sensor's field share, as independent errors [rad^2].
+
+    It is the bias but for that of the attitude: of fitted optics, which differs from part to part,
+    and of neighbours' light. The mean of n lines with a shared error is as wrong as if each had an
+    independent one of n times its variance.
+    """
+    shared = _direction_cov(rows, "bias")
+    whole = np.trace(shared, axis1=1, axis2=2) / 2
+    of_attitude = rows["attitude_rad2"].to_numpy() / np.where(whole > 0.0, whole, np.inf)
+    n = rows.select(pl.len().over("sensor_id", "field_part")).to_series().to_numpy()
+    return np.asarray((n * np.maximum(1.0 - of_attitude, 0.0))[:, None, None] * shared)
 
 
 def _direction_cov(rows: pl.DataFrame, which: str) -> Array:

@@ -18,7 +18,9 @@ from epipole.schemas.work_tables import ATTRIBUTABLES, SIGHTINGS
 from epipole.tasks.algorithms.constants import ARCSEC, GM_KM3_S2
 from epipole.tasks.algorithms.geometry.camera import Camera
 from epipole.tasks.algorithms.geometry.covariances import (
+    attitude_covariance,
     centroid_covariance,
+    few_stars_covariance,
     scatter_beyond,
     shared_direction_covariance,
 )
@@ -111,12 +113,29 @@ def sight_objects(
     return SensorSightings(frames, tracklets, camera, optics_covariance_of(cameras, row))
 
 
-def optics_covariance(
-    sightings: SensorSightings, R: Array, u_sensor: Array, from_stars: npt.NDArray[np.bool_]
-) -> Array:
-    """Return (n, 3, 3) covariances of directions, ICRS, due to the error of fitted optics [rad^2].
+class OpticsCovariances(NamedTuple):
+    """Covariances of directions, ICRS, due to the error of fitted optics: (n, 3, 3) each [rad^2].
 
-    It is shared by all frames; 0 where the optics are those of the log.
+    Both are shared by all frames. `turn` is that of the attitude, which turns all directions alike:
+    from few stars it compensates the optics less well than from many. `local` differs from part to
+    part of the field.
+    """
+
+    local: Array
+    turn: Array
+
+    @property
+    def whole(self) -> Array:
+        """Both together."""
+        return self.local + self.turn
+
+
+def optics_covariance(
+    sightings: SensorSightings, R: Array, u_sensor: Array, frame: Indices
+) -> OpticsCovariances:
+    """Return the covariances of directions due to the error of fitted optics.
+
+    They are 0 where the optics are those of the log.
 
     Parameters
     ----------
@@ -124,15 +143,20 @@ def optics_covariance(
         Attitudes, sensor from ICRS.
     u_sensor : (n, 3) float
         Measured directions, sensor axes.
-    from_stars : (n,) bool
-        Whether stars gave the attitude.
+    frame : (n,) int
+        Their frames.
     """
-    if not sightings.cov_optics.any():
-        return np.zeros_like(R)
-    shared = shared_direction_covariance(
-        sightings.camera, sightings.cov_optics, u_sensor, from_stars
-    )
-    return np.asarray(np.swapaxes(R, 1, 2) @ shared @ R)
+    camera, cov_optics = sightings.camera, sightings.cov_optics
+    if not cov_optics.any():
+        return OpticsCovariances(np.zeros_like(R), np.zeros_like(R))
+    frames = sightings.frames
+    from_stars = frames.from_stars[frame]
+    local = shared_direction_covariance(camera, cov_optics, u_sensor, from_stars)
+    n_stars = np.where(from_stars, np.maximum(array(frames.table, "n_stars")[frame], 1), np.inf)
+    of_attitude = few_stars_covariance(camera, cov_optics) / n_stars[:, None, None]
+    turn = attitude_covariance(u_sensor, of_attitude)
+    back = np.swapaxes(R, 1, 2)
+    return OpticsCovariances(back @ local @ R, back @ turn @ R)
 
 
 def _with_lone(frames: Frames, detections: pa.Table, settings: TrackletSettings) -> pa.Table:
@@ -293,9 +317,7 @@ def _bias_sigma(sightings: SensorSightings, rows: Indices) -> Array:
     frame, u_icrs = tracklets.frame[rows], tracklets.u_icrs[rows]
     R = matrix_from_quaternion(frames.q_sensor_from_icrs[frame])
     u_sensor = np.einsum("nij,nj->ni", R, u_icrs)
-    shared = tracklets.cov_bias[rows] + optics_covariance(
-        sightings, R, u_sensor, frames.from_stars[frame]
-    )
+    shared = tracklets.cov_bias[rows] + optics_covariance(sightings, R, u_sensor, frame).whole
     trace = np.trace(shared, axis1=1, axis2=2) - 2 * tracklets.blend_rad2[rows]
     return np.sqrt(np.maximum(trace / 2, 0.0))
 

@@ -22,7 +22,10 @@ Indices = npt.NDArray[np.int64]
 Flags = npt.NDArray[np.bool_]
 
 # Columns of VIEWS that are only passed on.
-LABELS = ("epoch", "sensor_id", "frame_number", "tracklet_id", "centroid", "x_px", "y_px")
+LABELS = (
+    *("epoch", "sensor_id", "frame_number", "tracklet_id", "centroid", "x_px", "y_px"),
+    *("attitude_rad2", "field_part"),
+)
 
 
 class ObjectViews(NamedTuple):

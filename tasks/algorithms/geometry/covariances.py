@@ -26,6 +26,7 @@ MAX_PRODUCT = 20.0  # [variances] a larger product of two residuals is of anothe
 MIN_RESIDUALS = 20  # minimum number: their variance is then known to a third
 OPTICS = ("fx_px", "fy_px", "cx_px", "cy_px", "k1", "k2", "p1", "p2", "k3")
 FRAMES_AT_ONCE = 500  # limits the memory: 27 derivatives per star
+ALL_AT_ONCE = np.zeros(1, np.int64)  # all directions are of one frame
 GRID = 9  # grid positions on each side of the image, for a frame's stars
 
 
@@ -194,17 +195,40 @@ def shared_direction_covariance(
         Measured directions, sensor frame.
     from_stars : (n,) bool
         Whether the attitude is from stars, with the same optics. The attitude then compensates a
-        part of the error, computed for stars all over the image.
+        part of the error, computed for stars all over the image: see `few_stars_covariance`.
     """
-    side = np.linspace(0.0, camera.width - 1.0, GRID)
-    down = np.linspace(0.0, camera.height - 1.0, GRID)
-    x_px, y_px = (axis.ravel() for axis in np.meshgrid(side, down))
-    grid = unproject(camera, x_px, y_px)
-    turns = _apparent_turns(camera, grid)
-    lever = _levers(turns, grid, np.ones(len(grid)), np.zeros(1, np.int64))
+    grid = _grid(camera)
+    lever = _levers(_apparent_turns(camera, grid), grid, np.ones(len(grid)), ALL_AT_ONCE)
     compensated = from_stars[:, None, None] * lever
     moved = skew(u) @ (_apparent_turns(camera, u) - compensated)
     return moved @ cov_optics @ np.swapaxes(moved, -1, -2)
+
+
+def few_stars_covariance(camera: Camera, cov_optics: Array) -> Array:
+    """Return the (3, 3) covariance of attitudes, times their number of stars [rad^2].
+
+    It is that of attitudes from few stars about those from stars all over the image, due to the
+    error of the optics. About the sensor axes; shared by the frames with the same stars.
+
+    Notes
+    -----
+    The attitude is a mean over the stars. If they are anywhere in the image, the covariance of a
+    mean of n is that of one over n.
+    """
+    grid = _grid(camera)
+    turns, across = _apparent_turns(camera, grid), np.eye(3) - grid[:, :, None] * grid[:, None, :]
+    left = turns - across @ _levers(turns, grid, np.ones(len(grid)), ALL_AT_ONCE)
+    scatter = np.sum(left @ cov_optics @ np.swapaxes(left, 1, 2), axis=0)
+    weight = np.linalg.inv(across.sum(axis=0))
+    return np.asarray(len(grid) * weight @ scatter @ weight)
+
+
+def _grid(camera: Camera) -> Array:
+    """Return directions all over the image, sensor frame: (81, 3)."""
+    middle = (np.arange(GRID) + 0.5) / GRID
+    side, down = (middle * size - 0.5 for size in (camera.width, camera.height))
+    x_px, y_px = (axis.ravel() for axis in np.meshgrid(side, down))
+    return unproject(camera, x_px, y_px)
 
 
 def _apparent_turns(camera: Camera, u: Array) -> Array:

@@ -66,7 +66,8 @@ class Lines(NamedTuple):
     u : (n, 3) float
         Measured directions, aberration removed.
     cov : (n, 2, 2) float
-        Covariance of their independent errors on `tangent_basis(u)` [rad^2].
+        Covariance of their independent errors on `tangent_basis(u)` [rad^2]; and of those that n
+        lines share, but not all of the sensor, times n.
     x_km, v_km_s : (n, 3) float
         Solved position and velocity of the object at the line's time, GCRF.
     r_km, v_sensor_km_s : (n, 3) float
@@ -146,7 +147,8 @@ def judge_sensors(
         Lines of sight, in any order. Groups of one line are skipped.
     position_sigma_km, attitude_sigma_rad : (s,) float
         1-sigma per axis of the biases that a sensor keeps over the night: of its position
-        [km], and of its attitude [rad] (0 for attitudes from stars, which are never at fault).
+        [km], and of its attitude [rad] (0 for attitudes from stars with right optics, which are
+        never at fault).
     guess_s : (s,) float
         Initial clock offsets; needed if one is seconds. Default 0.
 
@@ -227,8 +229,7 @@ class Model:
     def spread(self) -> tuple[float, float]:
         """Return the likeliest 1-sigma error of all ephemerides, per axis [km], and its log odds.
 
-        They are against the errors that the sensors state. Both are 0 where the largest error that
-        is tried is the likeliest: something else is wrong then, such as uncertain optics.
+        They are against the errors that the sensors state.
         """
         evidence = []
         for spread_km in SPREADS_KM:
@@ -239,8 +240,6 @@ class Model:
             fit = float(b @ np.linalg.solve(A, b) - np.linalg.slogdet(A)[1])
             evidence.append(fit + float(np.log(weight).sum() - np.sum(weight * self.guess**2)))
         best = int(np.argmax(evidence))
-        if best == len(SPREADS_KM) - 1:
-            return 0.0, 0.0
         return float(SPREADS_KM[best]), evidence[best] / 2 - self.evidence(frozenset())
 
     def size(self, sensor: int, cause: str, faults: Faults) -> tuple[float, float]:

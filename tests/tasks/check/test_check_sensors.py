@@ -1,13 +1,16 @@
 """Check of sensors: what was corrected and what remains; nothing from nothing."""
 
 import numpy as np
+from scenes.associations import filled
+from scenes.late_sensors import POSITION_KM, SIGMA, lines_of
 
 from epipole.io.work.parts import SOLVED, write_part
 from epipole.io.work.work_layout import SolvedParts, ViewedParts
-from epipole.schemas.bridge import empty, to_polars
+from epipole.schemas.bridge import empty, to_polars, unstack
 from epipole.schemas.spans import SPAN_NS, Sensor, Span
 from epipole.schemas.tables import POSITIONS
 from epipole.schemas.work_tables import CLOCK_LINES, VIEWS
+from epipole.tasks.algorithms.constants import ARCSEC
 from epipole.tasks.check.check_sensors import (
     JudgedSights,
     SensorVerdict,
@@ -19,6 +22,7 @@ from epipole.tasks.solve.positions import solve_positions
 from epipole.tasks.solve.sample_sight_lines import LineSampling, moving_objects, sample_sight_lines
 from epipole.tasks.solve.view_groups import unpack_views
 
+PER_OBJECT = 3 * ARCSEC  # error of the optics
 LATE = SensorVerdict("a", 0.25, 0.01, "clock")
 EARLY = SensorVerdict("b", -0.5, 0.01, "clock")
 SOUND = SensorVerdict("c", 0.01, 0.01)
@@ -40,6 +44,40 @@ def test_without_views_no_clock_is_known():
     assert lines.equals(empty(CLOCK_LINES))
     assert sensor_verdicts(to_polars(lines)) == JudgedSights([])
     assert sensor_verdicts(to_polars(lines), {"a": 0.5}) == JudgedSights([])
+
+
+def rows_of(lines, attitude_rad2):
+    """Return CLOCK_LINES of nine objects, each in a part of the fields of its own."""
+    n = len(lines.group)
+    epoch, number = lines.group % 60, lines.group // 60
+    columns = {
+        "epoch": epoch, "sensor_id": [f"s{s}" for s in lines.sensor], "field_part": number,
+        "object_id": [f"o{k}" for k in number], "position_sigma_km": np.full(n, POSITION_KM),
+        "attitude_rad2": np.full(n, attitude_rad2),
+    }  # fmt: skip
+    for name, cov in (("noise", SIGMA**2), ("bias", PER_OBJECT**2)):
+        columns |= {f"cov_{name}_{a}{a}_rad2": np.full(n, cov) for a in "12"}
+    for pattern, values in (
+        ("u{}", lines.u), ("{}_km", lines.x_km), ("v{}_km_s", lines.v_km_s),
+        ("sensor_{}_km", lines.r_km), ("sensor_v{}_km_s", lines.v_sensor_km_s),
+    ):  # fmt: skip
+        columns |= unstack(pattern, values)
+    return to_polars(filled(CLOCK_LINES, n, columns))
+
+
+def test_errors_of_optics_that_differ_over_the_field_are_no_faults_of_sensors():
+    lines = lines_of(1, np.zeros(4))
+    off = np.random.default_rng(1).normal(size=(4, 9, 3)) * PER_OBJECT
+    u = lines.u + off[lines.sensor, lines.group // 60]
+    lines = lines._replace(u=u / np.linalg.norm(u, axis=1)[:, None])
+    judged = sensor_verdicts(rows_of(lines, 0.0))
+    assert not any(one.is_faulty for one in judged.verdicts)
+    assert not judged.doubt.undecided
+    assert judged.doubt.spread_log_odds < 3.0
+    # As turns of the sensors the same errors contradict each other.
+    alike = sensor_verdicts(rows_of(lines, PER_OBJECT**2))
+    faulty = any(one.is_faulty for one in alike.verdicts)
+    assert faulty or alike.doubt.undecided or alike.doubt.spread_log_odds > 6.0
 
 
 def test_without_objects_no_clock_is_known(tmp_path):

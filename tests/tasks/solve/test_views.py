@@ -64,7 +64,7 @@ def views_of(seen, source, flux, cov_optics=None):
     key = {"sensor_id": ["s"] * N_FRAMES, "frame_number": np.arange(N_FRAMES)}
     q = quaternion_from_matrix(np.tile(np.roll(np.eye(3), 1, axis=1), (N_FRAMES, 1, 1)))
     solutions = filled(SOLUTIONS, N_FRAMES, key | unstack("q{}", q, "xyzw") | {
-        "time": time, "attitude_source": [source] * N_FRAMES,
+        "time": time, "attitude_source": [source] * N_FRAMES, "n_stars": np.full(N_FRAMES, 100),
         **{f"cov_att_{ab}_arcsec2": np.full(N_FRAMES, stated**2 * (ab[0] == ab[1]))
            for ab in ("xx", "xy", "xz", "yy", "yz", "zz")},
         "x_km": np.full(N_FRAMES, 7000.0), **{f"{a}_km": np.zeros(N_FRAMES) for a in "yz"},

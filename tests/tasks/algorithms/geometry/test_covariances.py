@@ -7,6 +7,7 @@ from scipy.spatial.transform import Rotation
 from epipole.tasks.algorithms.geometry.camera import Camera, project, unproject
 from epipole.tasks.algorithms.geometry.covariances import (
     OPTICS,
+    few_stars_covariance,
     image_derivatives,
     scatter_beyond,
     shared_attitude_covariance,
@@ -93,6 +94,20 @@ def test_directions_move_as_with_other_optics_and_their_attitude(name):
     # A hundredth of the largest: the pipeline's own stars are fewer places.
     largest = np.abs(cov).max()
     np.testing.assert_allclose(cov, moved[:, :, None] * moved[:, None, :], atol=0.1 * largest)
+
+
+@pytest.mark.parametrize("name", ["fx_px", "k1", "p1"])
+def test_attitudes_from_few_stars_scatter_with_other_optics(name):
+    n, frames = 12, 300
+    u, other = (unproject(c, *places(n * frames)) for c in (CAMERA, changed(name)))
+    turns = np.array([
+        Rotation.align_vectors(other[k : k + n], u[k : k + n])[0].as_rotvec()
+        for k in range(0, n * frames, n)
+    ])  # fmt: skip
+    one = np.array([[name == other for other in OPTICS]], float) * SMALL[name]
+    sigma = np.sqrt(np.diag(few_stars_covariance(CAMERA, one.T @ one)) / n)
+    # About the boresight a field of 20 degrees hardly matters for directions.
+    np.testing.assert_allclose(turns.std(axis=0)[:2], sigma[:2], atol=0.2 * sigma.max())
 
 
 def test_attitude_and_principal_point_compensate_each_other():
