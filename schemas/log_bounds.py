@@ -154,9 +154,17 @@ DISTORTION = Bound(
     Reason.BAD_DISTORTION,
     "Of each term at the farthest corner, as a share of the corner's distance.",
 )
+LINE_TIME = Bound(
+    "line_time_s",
+    -1e-3,
+    1e-3,
+    "s",
+    Reason.BAD_LINE_TIME,
+    "A thousand rows in a second: rolling shutters take microseconds a row.",
+)
 
 BOUNDS = {
     "frame": (TIME, FRAME_NUMBER, EXPOSURE, CENTROID_POSITION, FLUX, CENTROID_SIGMA),
     "state": (TIME, POSITION, SPEED, POSITION_SIGMA, QUATERNION, ATTITUDE_SIGMA),
-    "calibration": (TIME, IMAGE_SIDE, FOCAL_LENGTH, FOCAL_RATIO, CORNER, DISTORTION),
+    "calibration": (TIME, IMAGE_SIDE, FOCAL_LENGTH, FOCAL_RATIO, CORNER, DISTORTION, LINE_TIME),
 }

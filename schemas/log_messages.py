@@ -71,3 +71,11 @@ SENSOR_STATE = MessageType(
 # The messages that this project declares, by kind.
 DECLARED = {FRAME: CENTROID_FRAME, STATE: SENSOR_STATE}
 CALIBRATION_NAME = "foxglove.CameraCalibration"
+# A field that this project adds to it; messages without it, and other readers, are not affected.
+LINE_TIME = Member(
+    "line_time_s",
+    1000,
+    "double",
+    "Rolling shutter: time from the exposure of one row to that of the next; negative where the "
+    "image is read from its last row; 0 or missing: all rows are exposed together.",
+)

@@ -238,6 +238,12 @@ class Reason(StrEnum):
         "bounds.",
         Trait.INVALID_CALIBRATION,
     )
+    BAD_LINE_TIME = (
+        "bad_line_time",
+        Stage.READ,
+        "The calibration's line_time_s is out of bounds.",
+        Trait.INVALID_CALIBRATION,
+    )
     FOLDED_IMAGE = (
         "folded_image",
         Stage.READ,

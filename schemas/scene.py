@@ -10,6 +10,7 @@ from typing import Annotated, Any, Literal, Self
 from pydantic import AwareDatetime, Field, ValidationError, model_validator
 
 from epipole.schemas.errors import SceneError
+from epipole.schemas.log_bounds import LINE_TIME
 from epipole.schemas.settings import Group
 from epipole.schemas.text import toml_values
 
@@ -177,6 +178,13 @@ class SceneCamera(Group):
         False,
         description="Without distortion, the distance from the principal point is the angle from "
         "the boresight times the focal length (ROS's equidistant).",
+    )
+    line_time_s: float = Field(
+        0.0,
+        ge=LINE_TIME.minimum,
+        le=LINE_TIME.maximum,
+        description="Rolling shutter: time from the exposure of one row to that of the next. The "
+        "middle row has the frame's time.",
     )
     departure: LensDeparture = LensDeparture()
 

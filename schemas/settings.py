@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Literal, Self
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
-from epipole.schemas.log_bounds import ATTITUDE_SIGMA, POSITION_SIGMA
+from epipole.schemas.log_bounds import ATTITUDE_SIGMA, LINE_TIME, POSITION_SIGMA
 from epipole.schemas.options import (
     ASSOCIATION,
     DEFAULT_CATALOGUE,
@@ -67,6 +67,13 @@ class Assumption(Group):
     )
     velocities: Literal["as stated", "unknown"] = Field(
         "as stated", description="Unknown: they come from its positions."
+    )
+    line_time_s: float | None = Field(
+        None,
+        ge=LINE_TIME.minimum,
+        le=LINE_TIME.maximum,
+        description="Rolling shutter of its calibrations: time from the exposure of one row to "
+        "that of the next. Default: as stated.",
     )
 
 

@@ -91,6 +91,9 @@ CAMERAS = schema(
             for name in ("fx_px", "fy_px", "cx_px", "cy_px", "k1", "k2", "p1", "p2", "k3", "k4")
         ],
         column("fisheye", pa.bool_(), doc="A fisheye instead of a pinhole."),
+        column(
+            "line_time_s", F64, unit="s", doc="Rolling shutter: from a row to the next; 0: none."
+        ),
         *covariance(
             "cov_{}",
             unit="products of the units of both numbers",

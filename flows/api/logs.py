@@ -58,6 +58,7 @@ _DEFAULTS: dict[str, Any] = {
     "vx_km_s": None, "vy_km_s": None, "vz_km_s": None, "position_sigma_km": 0.0,
     "qx": None, "qy": None, "qz": None, "qw": None, "attitude_sigma_arcsec": 0.0,
     "k1": 0.0, "k2": 0.0, "p1": 0.0, "p2": 0.0, "k3": 0.0, "k4": 0.0, "fisheye": False,
+    "line_time_s": 0.0,
 }  # fmt: skip
 
 
@@ -116,9 +117,9 @@ def write_log(
     frames, states, cameras
         Tables with the columns that `LogTables` names, in any order of rows. These columns may be
         left out: `exposure_s`, `flux`, `sigma_px`; velocities, sigmas and attitudes of states;
-        distortions `k1`, `k2`, `p1`, `p2`, `k3`, `k4` and `fisheye` of cameras. Times are UTC,
-        positions GCRF. A sensor's id has 1 to 63 letters of A-Z and a-z, digits, - and _; the first
-        is a letter or digit. A null sigma of a state is unknown, as 0 is.
+        distortions `k1`, `k2`, `p1`, `p2`, `k3`, `k4`, `fisheye` and `line_time_s` of cameras.
+        Times are UTC, positions GCRF. A sensor's id has 1 to 63 letters of A-Z and a-z, digits, -
+        and _; the first is a letter or digit. A null sigma of a state is unknown, as 0 is.
     encoding
         Of the messages: protobuf, json or ros2.
 

@@ -177,12 +177,14 @@ class LogWriter:
         """Write a calibration that holds from `time_ns` on.
 
         `camera` has width, height, fx_px, fy_px, cx_px, cy_px [px] and k1, k2, p1, p2, k3, as
-        a mapping or as attributes; a fisheye has k1, k2, k3, k4 and `fisheye`.
+        a mapping or as attributes; a fisheye has k1, k2, k3, k4 and `fisheye`, a rolling shutter
+        `line_time_s`.
         """
         if not isinstance(camera, Mapping):
             names = ("width", "height", "fx_px", "fy_px", "cx_px", "cy_px", "k1", "k2", "k3")
+            maybe = ("p1", "p2", "k4", "fisheye", "line_time_s")
             camera = {name: getattr(camera, name) for name in names} | {
-                name: getattr(camera, name, 0.0) for name in ("p1", "p2", "k4", "fisheye")
+                name: getattr(camera, name, 0.0) for name in maybe
             }
         self._write(CALIBRATION, time_ns, sensor_id, calibration_values(sensor_id, time_ns, camera))
 
@@ -271,7 +273,8 @@ def calibration_values(sensor_id: str, time_ns: int, camera: Values) -> dict[str
     """Return a camera as the values of a calibration message; see `LogWriter.camera`."""
     fx, fy, cx, cy = (float(camera[n]) for n in ("fx_px", "fy_px", "cx_px", "cy_px"))
     model, coefficients = distortion_of(camera)
-    return {
+    line_time_s = float(camera.get("line_time_s", 0.0))
+    values = {
         "timestamp": time_ns,
         "frame_id": sensor_id,
         "width": int(camera["width"]),
@@ -282,6 +285,7 @@ def calibration_values(sensor_id: str, time_ns: int, camera: Values) -> dict[str
         "R": [1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0],
         "P": [fx, 0.0, cx, 0.0, 0.0, fy, cy, 0.0, 0.0, 0.0, 1.0, 0.0],
     }
+    return values | ({"line_time_s": line_time_s} if line_time_s else {})
 
 
 # Files for viewers: foxglove's public schemas, as protobuf.

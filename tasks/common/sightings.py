@@ -15,8 +15,8 @@ from epipole.schemas.settings import TrackletSettings
 from epipole.schemas.spans import Span, spans_between
 from epipole.schemas.tables import DETECTIONS
 from epipole.schemas.work_tables import TRACKLET_RUNS
-from epipole.tasks.algorithms.constants import ARCSEC
-from epipole.tasks.algorithms.geometry.camera import Camera, unproject
+from epipole.tasks.algorithms.constants import ARCSEC, SECOND_NS
+from epipole.tasks.algorithms.geometry.camera import Camera, row_offset_s, unproject
 from epipole.tasks.algorithms.geometry.covariances import attitude_covariance, centroid_covariance
 from epipole.tasks.algorithms.geometry.directions import matrix_from_quaternion, unit_from_radec
 from epipole.tasks.algorithms.times import frame_interval_ns
@@ -82,20 +82,22 @@ class Sightings(NamedTuple):
     """Detections of one sensor, in the order of its frames.
 
     `row` is the row of the detection, `frame` the index of its frame. Frame k has the sightings
-    ``offsets[k]:offsets[k + 1]``. `cov_noise` is the error that is independent in each frame,
+    ``offsets[k]:offsets[k + 1]``. `time_ns` is the time of its row: the frame's without a rolling
+    shutter. `cov_noise` is the error that is independent in each frame,
     `cov_bias` the error that is common to all [rad^2, ICRS]: the error of an attitude from stars
     is independent, that of a prior is common.
     """
 
     row: npt.NDArray[np.int64]
     frame: npt.NDArray[np.int64]
+    time_ns: npt.NDArray[np.int64]
     offsets: npt.NDArray[np.int64]
     u_icrs: Array
     cov_noise: Array
     cov_bias: Array
 
 
-def sightings_of(frames: Frames, detections: pa.Table) -> Sightings:
+def sightings_of(frames: Frames, detections: pa.Table, cameras: pa.Table) -> Sightings:
     """Return the sightings in solved frames, sorted by frame."""
     row, frame = _in_frames(frames, detections)
     u = unit_from_radec(
@@ -108,11 +110,27 @@ def sightings_of(frames: Frames, detections: pa.Table) -> Sightings:
     return Sightings(
         row,
         frame,
+        _row_times(frames, detections, row, frame, cameras),
         np.searchsorted(frame, np.arange(len(frames.number) + 1)),
         u,
         noise + np.where(stars, attitude, 0.0),
         np.where(stars, 0.0, attitude),
     )
+
+
+def _row_times(
+    frames: Frames, detections: pa.Table, row: Indices, frame: Indices, cameras: pa.Table
+) -> Indices:
+    """Return the times of the image rows of detections [ns]."""
+    time_ns = frames.time_ns[frame]
+    if not cameras.num_rows or not array(cameras, "line_time_s").any():
+        return time_ns
+    y_px = array(detections, "y_px")[row].astype(float)
+    late_s = np.zeros(len(row))
+    for k in np.unique(frames.camera[frames.camera >= 0]).tolist():
+        at = frames.camera[frame] == k
+        late_s[at] = row_offset_s(camera_of(cameras, k), y_px[at])
+    return time_ns + np.rint(late_s * SECOND_NS).astype(np.int64)
 
 
 def image_sightings_of(frames: Frames, detections: pa.Table, camera: Camera) -> Sightings:
@@ -121,7 +139,7 @@ def image_sightings_of(frames: Frames, detections: pa.Table, camera: Camera) -> 
     u = unproject(camera, array(detections, "x_px")[row], array(detections, "y_px")[row])
     noise = centroid_covariance(u, array(detections, "sigma_arcsec")[row] * ARCSEC)
     offsets = np.searchsorted(frame, np.arange(len(frames.number) + 1))
-    return Sightings(row, frame, offsets, u, noise, np.zeros_like(noise))
+    return Sightings(row, frame, frames.time_ns[frame], offsets, u, noise, np.zeros_like(noise))
 
 
 def _in_frames(frames: Frames, detections: pa.Table) -> tuple[Indices, Indices]:
@@ -143,6 +161,7 @@ def part_of(sightings: Sightings, kept: npt.NDArray[np.bool_]) -> Sightings:
     return Sightings(
         sightings.row[kept],
         sightings.frame[kept],
+        sightings.time_ns[kept],
         before[sightings.offsets],
         sightings.u_icrs[kept],
         sightings.cov_noise[kept],

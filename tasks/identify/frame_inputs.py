@@ -15,7 +15,13 @@ from epipole.schemas.bridge import array, flatten, nullable, stack, table, unsta
 from epipole.schemas.log_bounds import POSITION, SPEED
 from epipole.schemas.settings import SensorSettings
 from epipole.schemas.work_tables import SENSOR_STATES_AT_FRAMES
-from epipole.tasks.algorithms.geometry.camera import Camera, inside, pixel_angle, unproject
+from epipole.tasks.algorithms.geometry.camera import (
+    Camera,
+    inside,
+    pixel_angle,
+    row_offset_s,
+    unproject,
+)
 from epipole.tasks.algorithms.orbits.state_interpolation import (
     InterpolatedStates,
     SensorStates,
@@ -39,11 +45,13 @@ class FlatCentroids(NamedTuple):
     y_px: Array
     flux: Array
     sigma_px: Array  # NaN where unknown
-    u: Array  # sensor axes
+    u: Array  # sensor axes at the frame's time
     pixel_rad: Array
     in_image: npt.NDArray[np.bool_]  # of the frame's camera; false without one
     camera_of_frame: npt.NDArray[np.int64]
     cameras: dict[int, Camera]
+    row_s: Array  # time of a centroid's row after the frame's
+    turn: Array  # (N, 3) rotation of directions from the frame's time to the row's [rad]
 
 
 def flatten_centroids(
@@ -58,17 +66,20 @@ def flatten_centroids(
         sigma_px = np.where(np.isnan(sigma_px), settings.centroid_sigma_px, sigma_px)
     camera_of_frame, used = _cameras_of(exposures, cameras)
     u, pixel_rad = np.zeros((len(x_px), 3)), np.ones(len(x_px))
+    row_s, turn = np.zeros(len(x_px)), np.zeros((len(x_px), 3))
     in_image = np.zeros(len(x_px), np.bool_)
     for row, camera in used.items():
         at = camera_of_frame[frame] == row
         u[at] = unproject(camera, x_px[at], y_px[at])
         pixel_rad[at] = pixel_angle(camera, u[at])
+        row_s[at] = row_offset_s(camera, y_px[at])
         # In the corners of a wide lens's image, a position may have no direction.
         in_image[at] = inside(camera, x_px[at], y_px[at]) & np.isfinite(u[at, 2])
     flux = _optional(exposures, "flux", len(x_px))
     return FlatCentroids(
-        first, frame, x_px, y_px, flux, sigma_px, u, pixel_rad, in_image, camera_of_frame, used
-    )
+        first, frame, x_px, y_px, flux, sigma_px, u, pixel_rad, in_image, camera_of_frame, used,
+        row_s, turn,
+    )  # fmt: skip
 
 
 def _optional(exposures: pa.Table, name: str, n: int) -> Array:

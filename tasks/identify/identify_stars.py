@@ -28,6 +28,7 @@ from epipole.tasks.algorithms.star_identification.sequence import Priors
 from epipole.tasks.common.sightings import optics_covariance_of
 from epipole.tasks.identify.cache_skies import CachedSkies, Catalogue
 from epipole.tasks.identify.frame_inputs import FlatCentroids, flatten_centroids
+from epipole.tasks.identify.rolling_shutter import identify_at_frame_times
 from epipole.tasks.identify.tabulate import (
     MatchedStars,
     StarAttitudes,
@@ -75,7 +76,10 @@ def identify_stars(
     order = np.argsort(array(exposures, "time"), kind="stable")
     exposures, frame_states = exposures.take(order), frame_states.take(order)
     centroids = flatten_centroids(exposures, cameras, sensors)
-    found, rows = _identify(exposures, frame_states, centroids, catalogue, sensors, identification)
+    (found, rows), centroids = identify_at_frame_times(
+        exposures, frame_states, centroids,
+        lambda c: _identify(exposures, frame_states, c, catalogue, sensors, identification),
+    )  # fmt: skip
     attitudes = _attitudes(frame_states, found, sensors)
     matches = _matches(found, rows, centroids)
     attitudes = _with_optics(attitudes, centroids, matches, cameras)

@@ -30,6 +30,7 @@ from epipole.tasks.algorithms.geometry.directions import (
     quaternion_from_matrix,
     radec_from_unit,
 )
+from epipole.tasks.algorithms.geometry.turning import turned
 from epipole.tasks.algorithms.photometry import flux_scale
 from epipole.tasks.algorithms.times import earth_velocity
 from epipole.tasks.identify.frame_inputs import FlatCentroids
@@ -136,6 +137,8 @@ def stars_table(
     frame = c.frame[m.at]
     v_km_s = barycentric_velocity(array(exposures, "time"), frame_states)
     u = np.einsum("nij,nj->ni", attitudes.R[frame], aberrate(m.u_icrs, v_km_s[frame]))
+    if c.row_s.any():
+        u = turned(u, c.turn[m.at])
     dx, dy = np.full((2, len(frame)), np.nan)
     for row, camera in c.cameras.items():
         at = c.camera_of_frame[frame] == row

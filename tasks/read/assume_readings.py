@@ -28,7 +28,9 @@ def as_assumed(piece: LogPiece, assumptions: Sequence[Assumption]) -> LogPiece:
             _with_times(rows, assumed) for rows in (piece.exposures, piece.states, piece.cameras)
         )
         piece = piece._replace(
-            exposures=exposures, states=_with_states(states, assumed), cameras=cameras
+            exposures=exposures,
+            states=_with_states(states, assumed),
+            cameras=_with_line_time(cameras, assumed),
         )
     return piece
 
@@ -79,6 +81,14 @@ def _with_states(states: pa.Table, assumed: Assumption) -> pa.Table:
         frame = np.where(of_sensor, assumed.states, array(states, "frame"))
         states = _with_column(states, "frame", pa.array(frame.tolist(), pa.string()))
     return without_velocities(states, of_sensor) if assumed.velocities == "unknown" else states
+
+
+def _with_line_time(cameras: pa.Table, assumed: Assumption) -> pa.Table:
+    if assumed.line_time_s is None:
+        return cameras
+    stated = array(cameras, "line_time_s")
+    line_time_s = np.where(_of_sensor(cameras, assumed), assumed.line_time_s, stated)
+    return _with_column(cameras, "line_time_s", pa.array(line_time_s))
 
 
 def without_velocities(states: pa.Table, rows: npt.NDArray[np.bool_] | None = None) -> pa.Table:

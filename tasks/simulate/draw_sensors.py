@@ -43,7 +43,9 @@ def sent_optics(camera: SceneCamera) -> TrueOptics:
     cx = (camera.width - 1) / 2 if camera.cx_px is None else camera.cx_px
     cy = (camera.height - 1) / 2 if camera.cy_px is None else camera.cy_px
     lens = camera.k1, camera.k2, camera.p1, camera.p2, camera.k3, camera.k4, camera.fisheye
-    return TrueOptics(camera.width, camera.height, focal, focal, cx, cy, *lens)
+    return TrueOptics(
+        camera.width, camera.height, focal, focal, cx, cy, *lens, line_time_s=camera.line_time_s
+    )
 
 
 def true_optics(camera: SceneCamera) -> TrueOptics:

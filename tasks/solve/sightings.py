@@ -15,7 +15,7 @@ from epipole.schemas.columns import ATTRIBUTABLE_AXES
 from epipole.schemas.settings import TrackletSettings
 from epipole.schemas.spans import Span
 from epipole.schemas.work_tables import ATTRIBUTABLES, SIGHTINGS
-from epipole.tasks.algorithms.constants import ARCSEC, GM_KM3_S2
+from epipole.tasks.algorithms.constants import ARCSEC, GM_KM3_S2, SECOND_NS
 from epipole.tasks.algorithms.geometry.camera import Camera
 from epipole.tasks.algorithms.geometry.covariances import (
     attitude_covariance,
@@ -57,6 +57,7 @@ class TrackletSightings(NamedTuple):
     """
 
     frame: Indices
+    time_ns: Indices
     centroid: Indices
     u_icrs: Array
     cov_noise: Array
@@ -108,7 +109,7 @@ def sight_objects(
         return None
     row = int(frames.camera[0])
     camera = camera_of(cameras, row)
-    tracklets = _with_split_prior(_by_tracklet(frames, tracked), frames, half_width_s)
+    tracklets = _with_split_prior(_by_tracklet(frames, tracked, cameras), frames, half_width_s)
     tracklets = _with_blends(tracklets, frames, camera)
     return SensorSightings(frames, tracklets, camera, optics_covariance_of(cameras, row))
 
@@ -169,14 +170,15 @@ def _with_lone(frames: Frames, detections: pa.Table, settings: TrackletSettings)
     return with_lone_detections(detections, lone)
 
 
-def _by_tracklet(frames: Frames, tracked: pa.Table) -> TrackletSightings:
-    sightings = sightings_of(frames, tracked)
+def _by_tracklet(frames: Frames, tracked: pa.Table, cameras: pa.Table) -> TrackletSightings:
+    sightings = sightings_of(frames, tracked, cameras)
     rank, names = factorize(tracked, "tracklet_id")
     rank = rank[sightings.row]
     order = np.lexsort((sightings.frame, rank))
     bounds = group_offsets(rank[order])
     return TrackletSightings(
         sightings.frame[order],
+        sightings.time_ns[order],
         array(tracked, "centroid")[sightings.row[order]],
         sightings.u_icrs[order],
         sightings.cov_noise[order],
@@ -207,6 +209,7 @@ def _with_blends(tracklets: TrackletSightings, frames: Frames, camera: Camera) -
     left = np.concatenate([[0], np.cumsum(of_object)])
     return TrackletSightings(
         tracklets.frame[of_object],
+        tracklets.time_ns[of_object],
         tracklets.centroid[of_object],
         tracklets.u_icrs[of_object],
         tracklets.cov_noise[of_object],
@@ -234,7 +237,7 @@ def _with_split_prior(
     u = aberrate(tracklets.u_icrs, -v[tracklets.frame])
     noise_rad2 = np.trace(tracklets.cov_noise, axis1=1, axis2=2)[prior] / 2
     tracklet = tracklets.tracklet[prior]
-    time_s = (frames.time_ns[tracklets.frame] - frames.time_ns[0]) / 1e9
+    time_s = (tracklets.time_ns - frames.time_ns[0]) / 1e9
     fit = directions_at(
         tracklets.bounds[tracklet],
         tracklets.bounds[tracklet + 1],
@@ -268,15 +271,14 @@ def tabulate_sightings(sightings: SensorSightings | None) -> pa.Table:
         return empty(SIGHTINGS)
     frames, tracklets = sightings.frames, sightings.tracklets
     frame = tracklets.frame
-    v_km_s = frames.v_gcrf_km_s[frame]
-    u = aberrate(tracklets.u_icrs, -np.nan_to_num(v_km_s))
+    u = aberrate(tracklets.u_icrs, -np.nan_to_num(frames.v_gcrf_km_s[frame]))
     ra, dec = radec_from_unit(u)
     noise = _on_sky(u, _noise(sightings, u))
     sigma = np.sqrt(np.diagonal(noise, axis1=1, axis2=2))
-    r_km = frames.r_gcrf_km[frame]
+    r_km, v_km_s = _states_at_rows(frames, tracklets)
     magnitude, magnitude_sigma = _magnitudes(sightings)
     columns = {
-        "time": frames.time_ns[frame],
+        "time": tracklets.time_ns,
         "sensor_id": array(frames.table, "sensor_id")[frame],
         "frame_number": frames.number[frame],
         "centroid": tracklets.centroid,
@@ -292,7 +294,7 @@ def tabulate_sightings(sightings: SensorSightings | None) -> pa.Table:
         "tracklet_id": tracklets.name[tracklets.tracklet],
     }
     kept = np.flatnonzero(np.isfinite(r_km[:, 0]))
-    kept = kept[np.argsort(frames.time_ns[frame[kept]], kind="stable")]
+    kept = kept[np.argsort(tracklets.time_ns[kept], kind="stable")]
     maybe = {
         "magnitude": magnitude,
         "magnitude_sigma": magnitude_sigma,
@@ -303,6 +305,14 @@ def tabulate_sightings(sightings: SensorSightings | None) -> pa.Table:
         {name: values[kept] for name, values in columns.items()}
         | {name: nullable(values[kept]) for name, values in maybe.items()},
     )
+
+
+def _states_at_rows(frames: Frames, tracklets: TrackletSightings) -> tuple[Array, Array]:
+    """Return the sensor's positions and velocities at the times of sightings."""
+    late_ns = tracklets.time_ns - frames.time_ns[tracklets.frame]
+    if not late_ns.any():
+        return frames.r_gcrf_km[tracklets.frame], frames.v_gcrf_km_s[tracklets.frame]
+    return states_near_frames(frames, tracklets.frame, -late_ns / SECOND_NS)
 
 
 def _noise(sightings: SensorSightings, u: Array) -> Array:
@@ -341,7 +351,7 @@ def tabulate_attributables(
     by_name = {name: row for row, name in enumerate(grouped.name)}
     number = np.array([by_name.get(name, -1) for name in names], np.int64)
     names, middle, number = names[number >= 0], middle[number >= 0], number[number >= 0]
-    origin, time_ns = frames.time_ns[0], frames.time_ns[grouped.frame]
+    origin, time_ns = frames.time_ns[0], grouped.time_ns
     u = aberrate(grouped.u_icrs, -np.nan_to_num(frames.v_gcrf_km_s[grouped.frame]))
     fit = attributables(
         np.stack([grouped.bounds[number], grouped.bounds[number + 1]], axis=1),

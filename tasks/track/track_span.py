@@ -107,7 +107,7 @@ def measure_runs(
     order = np.lexsort((sightings.frame, track))
     order = order[track[order] != NONE]
     bounds = np.flatnonzero(np.diff(track[order], prepend=NONE, append=NONE))
-    time_s = (frames.time_ns[sightings.frame] - frames.time_ns[0]) / 1e9
+    time_s = (sightings.time_ns - frames.time_ns[0]) / 1e9
     first = np.repeat(bounds[:-1], np.diff(bounds))
     last = np.repeat(bounds[1:], np.diff(bounds))
     u, t = np.take(sightings.u_icrs, order, axis=0), time_s[order]
@@ -212,7 +212,8 @@ def _parts(
     if len(frames.number):
         camera = camera_of(cameras, int(frames.camera[0]))
         interval_s = frame_interval_ns(frames.time_ns) / 1e9
-        yield _TrackedFrames(frames, sightings_of(frames, detections), camera, interval_s, True)
+        seen = sightings_of(frames, detections, cameras)
+        yield _TrackedFrames(frames, seen, camera, interval_s, True)
     unsolved = unsolved_frames(solutions)
     if len(unsolved.number):
         camera = camera_of(cameras, int(unsolved.camera[0]))
@@ -372,7 +373,7 @@ def _link(
     offsets = np.cumsum([0, *(len(run.members) for run in runs)])
     fragments = Fragments(
         offsets.astype(np.int64),
-        (frames.time_ns[sightings.frame[members]] - frames.time_ns[0]) / 1e9,
+        (sightings.time_ns[members] - frames.time_ns[0]) / 1e9,
         sightings.u_icrs[members],
         sighting_sigma(sightings)[members],
     )

@@ -12,7 +12,14 @@ from epipole.io.logs.messages.batches import MessageBatch, fault, known_id
 from epipole.io.logs.messages.encoding import CalibrationMessage
 from epipole.schemas.bridge import table, unstack_covariance
 from epipole.schemas.columns import OPTICS_AXES
-from epipole.schemas.log_bounds import CORNER, DISTORTION, FOCAL_LENGTH, FOCAL_RATIO, IMAGE_SIDE
+from epipole.schemas.log_bounds import (
+    CORNER,
+    DISTORTION,
+    FOCAL_LENGTH,
+    FOCAL_RATIO,
+    IMAGE_SIDE,
+    LINE_TIME,
+)
 from epipole.schemas.rejects import Reason
 from epipole.schemas.work_tables import CAMERAS
 
@@ -71,6 +78,7 @@ class CameraColumns:
                 "cy_px": matrices[:, 5],
                 **dict(zip(TERMS, distortion.T, strict=True)),
                 "fisheye": [c.distortion_model in FISHEYE for c in rows],
+                "line_time_s": np.array([c.line_time_s for c in rows], float),
                 **unstack_covariance("cov_{}", np.zeros((len(rows), 9, 9)), OPTICS_AXES),
             },
         )
@@ -95,6 +103,8 @@ def _camera_fault(calibration: CalibrationMessage) -> Reason | None:
         or not np.isfinite(calibration.D).all()
     ):
         return Reason.BAD_DISTORTION
+    if calibration.line_time_s not in LINE_TIME:
+        return LINE_TIME.reason
     if len(calibration.K) != 9:
         return Reason.BAD_CAMERA_MATRIX
     # A recorder may repeat one calibration with each frame.

@@ -54,6 +54,7 @@ class CalibrationMessage(NamedTuple):
     distortion_model: str
     D: Array
     K: Array
+    line_time_s: float = 0.0
 
 
 DecodedMessage = FrameMessage | StateMessage | CalibrationMessage
@@ -71,8 +72,9 @@ def valid_time_ns(seconds: int, nanos: int) -> int | None:
 
 # The definition of an encoding.
 
-# Fields by name. A calibration has timestamp, frame_id, width, height, distortion_model, D, K,
-# R and P; the other kinds have the fields that `epipole.schemas.log_messages` declares.
+# Fields by name. A calibration has timestamp, frame_id, width, height, distortion_model, D, K, R
+# and P, and line_time_s where it is not 0; the other kinds have the fields that
+# `epipole.schemas.log_messages` declares.
 Values = Mapping[str, Any]
 
 # What decoders raise where bytes are not a message. Whatever else they raise is a bug.

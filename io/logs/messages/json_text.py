@@ -27,6 +27,7 @@ from epipole.schemas.log_messages import (
     CENTROID_FRAME,
     DECLARED,
     FRAME,
+    LINE_TIME,
     SENSOR_STATE,
     STATE,
 )
@@ -52,6 +53,7 @@ _CALIBRATION: dict[str, Any] = {
     "height": {"type": "integer"},
     "distortion_model": {"type": "string"},
     **{name: {"type": "array", "items": {"type": "number"}} for name in "DKRP"},
+    LINE_TIME.name: {"type": "number", "description": LINE_TIME.doc},
 }
 
 
@@ -141,6 +143,7 @@ def _calibration(values: Mapping[str, Any]) -> CalibrationMessage:
         _text(values.get("distortion_model", values.get("distortionModel", ""))),
         _array(values.get("D")),
         _array(values.get("K")),
+        float(values.get(LINE_TIME.name, values.get(json_name(LINE_TIME.name), 0.0))),
     )
 
 

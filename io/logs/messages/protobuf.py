@@ -39,6 +39,7 @@ from epipole.schemas.log_messages import (
     CENTROID_FRAME,
     DECLARED,
     FRAME,
+    LINE_TIME,
     SENSOR_STATE,
     STATE,
     MessageType,
@@ -108,10 +109,33 @@ def protobuf_schema(kind: str) -> bytes:
     files = descriptor_pb2.FileDescriptorSet()
     if kind == CALIBRATION:
         add_file(files, CameraCalibration.DESCRIPTOR.file)
+        _declare_line_time(files.file[-1])
     else:
         add_file(files, timestamp_pb2.DESCRIPTOR)
         files.file.append(file_descriptor())
     return files.SerializeToString(deterministic=True)
+
+
+def _declare_line_time(file: descriptor_pb2.FileDescriptorProto) -> None:
+    """Add the field of the line time to the file of a calibration."""
+    message = next(m for m in file.message_type if m.name == CALIBRATION_NAME.rpartition(".")[2])
+    message.field.add(
+        name=LINE_TIME.name,
+        number=LINE_TIME.number,
+        label=_FieldProto.LABEL_OPTIONAL,
+        type=_TYPES[LINE_TIME.type],
+        json_name=json_name(LINE_TIME.name),
+    )
+
+
+@cache
+def calibration_class() -> Any:
+    """Return the protobuf class of a calibration, with its line time."""
+    pool = descriptor_pool.DescriptorPool()
+    files = descriptor_pb2.FileDescriptorSet.FromString(protobuf_schema(CALIBRATION))
+    for file in files.file:
+        pool.Add(file)
+    return message_factory.GetMessageClass(pool.FindMessageTypeByName(CALIBRATION_NAME))
 
 
 def add_file(files: descriptor_pb2.FileDescriptorSet, file: Any) -> None:
@@ -183,7 +207,7 @@ def encode(kind: str, values: Values) -> bytes:
 
 
 def _encode_calibration(values: Values) -> bytes:
-    message = CameraCalibration(
+    message = calibration_class()(
         **{name: value for name, value in values.items() if name != "timestamp"}
     )
     message.timestamp.seconds, message.timestamp.nanos = divmod(values["timestamp"], SECOND_NS)
@@ -257,7 +281,7 @@ def _state(m: Any) -> StateMessage:
 
 
 def _calibration(data: bytes) -> CalibrationMessage:
-    m = CameraCalibration.FromString(data)
+    m = calibration_class().FromString(data)
     return CalibrationMessage(
         _time_ns(m),
         m.frame_id,
@@ -266,6 +290,7 @@ def _calibration(data: bytes) -> CalibrationMessage:
         m.distortion_model,
         np.array(m.D, float),
         np.array(m.K, float),
+        m.line_time_s,
     )
 
 

@@ -29,6 +29,7 @@ from epipole.schemas.log_messages import (
     CENTROID_FRAME,
     DECLARED,
     FRAME,
+    LINE_TIME,
     SENSOR_STATE,
     STATE,
     MessageType,
@@ -141,6 +142,8 @@ def encode(kind: str, values: Values) -> bytes:
     """Return a message as CDR; a calibration as sensor_msgs/msg/CameraInfo."""
     out = CdrWriter()
     if kind == CALIBRATION:
+        if values.get(LINE_TIME.name):
+            raise ValueError("a CameraInfo has no line time: assume it where the log is read")
         _put_camera_info(out, values)
         return out.message()
     for member in DECLARED[kind].members:

@@ -39,6 +39,8 @@ class Camera(NamedTuple):
         Distortion, Brown-Conrady, in the order of OpenCV; k4 is of the eighth power.
     fisheye : bool
         Without distortion, the distance from the principal point is the angle from the boresight.
+    line_time_s : float
+        Rolling shutter: time from the exposure of one row to that of the next [s].
     """
 
     width: int
@@ -54,6 +56,7 @@ class Camera(NamedTuple):
     k3: float = 0.0
     k4: float = 0.0
     fisheye: bool = False
+    line_time_s: float = 0.0
 
     @property
     def distorts(self) -> bool:
@@ -99,7 +102,15 @@ def mirrored(camera: Camera) -> Camera:
 def flip_rows(camera: Camera, y_px: Array) -> tuple[Camera, Array]:
     """Return the same camera and pixel rows (n,) with the image's rows counted the other way."""
     last = camera.height - 1
-    return camera._replace(fy_px=-camera.fy_px, cy_px=last - camera.cy_px), last - y_px
+    flipped = camera._replace(
+        fy_px=-camera.fy_px, cy_px=last - camera.cy_px, line_time_s=-camera.line_time_s
+    )
+    return flipped, last - y_px
+
+
+def row_offset_s(camera: Camera, y_px: Array) -> Array:
+    """Return the time of each row (n,) after the frame's, which is that of the middle row [s]."""
+    return (y_px - 0.5 * (camera.height - 1)) * camera.line_time_s
 
 
 FARTHEST = 4.0  # radius up to which a fold is looked for, normalised coordinates

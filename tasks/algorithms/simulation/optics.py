@@ -14,7 +14,7 @@ Array = npt.NDArray[np.float64]
 
 
 class TrueOptics(NamedTuple):
-    """Pinhole and lens [px; the coefficients have no unit]."""
+    """Pinhole and lens [px; the coefficients have no unit], and the time from row to row [s]."""
 
     width: int
     height: int
@@ -29,6 +29,7 @@ class TrueOptics(NamedTuple):
     k3: float = 0.0
     k4: float = 0.0
     fisheye: bool = False
+    line_time_s: float = 0.0
 
 
 def bend(optics: TrueOptics, x: Array, y: Array) -> tuple[Array, Array]:

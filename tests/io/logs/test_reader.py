@@ -354,6 +354,8 @@ def test_an_invalid_sigma_is_unknown(tmp_path, sigma):
         ({"p1": 5.0}, "bad_distortion"),
         ({"k1": -5.0}, "folded_image"),  # folds at 0.26 of 0.35
         ({"p2": -0.9}, "folded_image"),
+        ({"line_time_s": 0.1}, "bad_line_time"),
+        ({"line_time_s": np.nan}, "bad_line_time"),
         ({"fx_px": 426.0, "fy_px": 426.0, "k1": -0.5, "k2": 0.0, "k3": 0.0}, "folded_image"),
     ],
 )

@@ -132,7 +132,7 @@ def _decode_text(kind, data):
             values[name] = words[0]
         elif name in _INTEGERS:
             values[name] = int(words[0])
-        elif name == "exposure_s" or "_sigma_" in name:
+        elif name in ("exposure_s", "line_time_s") or "_sigma_" in name:
             values[name] = float(words[0])
         else:
             values[name] = np.array(words, float)
@@ -140,7 +140,7 @@ def _decode_text(kind, data):
     if kind == CALIBRATION:
         values["sensor_id"] = values.pop("frame_id")
     message = _MESSAGES[kind]
-    return message(**{name: values[name] for name in message._fields})
+    return message(**{name: values[name] for name in message._fields if name in values})
 
 
 ENCODING = MessageEncoding(

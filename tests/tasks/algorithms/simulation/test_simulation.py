@@ -10,6 +10,7 @@ import numpy as np
 import polars as pl
 import pytest
 from astropy.time import Time
+from scenes.simulated import scene_of
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 from skyfield.api import Star, load
@@ -321,6 +322,50 @@ def test_it_reproduces_the_logs_of_another_simulator_to_their_noise(name):
             assert abs(off[kind].mean()) < 4 / np.sqrt(n)
             assert abs(off[kind].std() - 1) < 4 / np.sqrt(2 * n)
             assert np.abs(off[kind]).max() < 5.5
+
+
+@pytest.mark.parametrize("line_time_s", [1e-4, -5e-5])
+def test_each_spot_of_a_rolling_shutter_is_where_it_is_when_its_row_is_exposed(line_time_s):
+    quiet = {"sigma_px": 1e-9, "false_points": 0.0}
+    pointing = {"mode": "spin", "ra_deg": 61.0, "dec_deg": 2.0, "axis": [0.3, 0.8, -0.2]}
+    camera = {"fov_deg": 12.0, "line_time_s": line_time_s}
+    near = {"a_km": 7400.0, "true_anomaly_deg": 2.0}
+    scene = scene_of(
+        {"pointing": pointing | {"rate_deg_s": 1.5}, "camera": camera, "detection": quiet,
+         "orbit": {"a_km": 7000.0, "true_anomaly_deg": -4.0}, "rate_hz": 5.0},
+        duration_s=4.0,
+        targets=[{"orbit": near, "count": 20, "spread_km": 100.0, "magnitude": 5.0}],
+    )  # fmt: skip
+    simulation = simulate_scene(scene)
+    (seen,) = next(expose_blocks(simulation))
+    frame = np.repeat(np.arange(len(seen.time_ns)), np.diff(seen.offsets))
+    t_s = (seen.time_ns - simulation.t0_ns) / 1e9
+    row_s = t_s[frame] + (seen.y_px - 511.5) * line_time_s
+    # The sensor turns evenly: between two frames, and beyond the last, along one arc.
+    turn = (seen.attitude[-1] * seen.attitude[0].inv()).as_rotvec() / (t_s[-1] - t_s[0])
+    q = Rotation.from_rotvec((row_s - t_s[0])[:, None] * turn) * seen.attitude[0]
+    earth_km, earth_km_s = earth_at(simulation.t0_ns + np.rint(row_s * 1e9).astype(np.int64))
+    r_km, v_km_s = state_at(simulation.sensors[0].path.elements, row_s)
+    is_star = seen.kind == 0
+    stars = read_hipparcos_stars(8.0)
+    field = field_of(stars)
+    d = np.empty((len(frame), 3))
+    order = np.argsort(field.star_id)
+    star = order[np.searchsorted(field.star_id[order], seen.source[is_star])]
+    years = julian_years_since(1991.25, seen.time_ns[frame[is_star]])
+    d[is_star] = star_directions(field, star, years, (earth_km + r_km)[is_star])
+    paths = simulation.objects.paths.elements[seen.source[~is_star]]
+    d[~is_star], _ = received_from(
+        partial(state_at, paths), row_s[~is_star], r_km[~is_star], earth_km_s[~is_star]
+    )
+    u = q.apply(boost(d / np.linalg.norm(d, axis=1, keepdims=True), earth_km_s + v_km_s))
+    x, y = image_position(simulation.sensors[0].optics, u)
+    off_px = np.hypot(seen.x_px - x, seen.y_px - y)
+    alone = ~np.isin(seen.source, list(close_to_others(stars, 1e-3)))
+    assert (is_star & alone).sum() > 100
+    assert (~is_star).sum() > 100
+    assert off_px[alone | ~is_star].max() < 2e-3
+    assert np.ptp(row_s - t_s[frame]) > 1000 * abs(line_time_s) * 0.9
 
 
 def spots_of(log):

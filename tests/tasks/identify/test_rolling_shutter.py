@@ -1,0 +1,206 @@
+"""Rolling shutter: attitudes, stars and directions of objects against a simulated truth."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import polars as pl
+import pyarrow as pa
+import pytest
+from scenes.identified import identified, tracked
+from scenes.whole_logs import read_whole
+from scipy.spatial.transform import Rotation
+
+from epipole.flows.simulate import simulate
+from epipole.io.catalogues.star_catalogue import read_star_catalogue
+from epipole.io.logs.reader import read_log_pieces
+from epipole.schemas.bridge import array, stack, stack_covariance
+from epipole.schemas.scene import validate_scene
+from epipole.schemas.settings import Assumption, Settings
+from epipole.tasks.algorithms.constants import ARCSEC, SPEED_OF_LIGHT_KM_S
+from epipole.tasks.algorithms.geometry.directions import unit_from_radec
+from epipole.tasks.algorithms.geometry.turning import angular_rates, turned
+from epipole.tasks.algorithms.simulation.paths import state_at
+from epipole.tasks.identify.frame_inputs import interpolate_sensor_states
+from epipole.tasks.read.assume_readings import as_assumed
+from epipole.tasks.solve.sightings import sight_objects, tabulate_sightings
+
+LINE_S = 1e-4  # an image of 1024 rows takes a tenth of a second
+SEEN = {"a_km": 7378.0, "i_deg": 70.0, "raan_deg": 2.0, "true_anomaly_deg": 0.0}
+SENSORS = [
+    # Turns by 0.1 deg while an image is read: 13 px. Few stars.
+    {
+        "id": "spins",
+        "orbit": {"a_km": 42164.0, "i_deg": 60.0},
+        "camera": {"fov_deg": 8.0, "line_time_s": LINE_S},
+        "pointing": {"mode": "spin", "ra_deg": 80.0, "dec_deg": 10.0, "axis": [0.2, -0.5, 0.7],
+                     "rate_deg_s": 1.0},
+        "magnitude_limit": 6.5,
+        "rate_hz": 2.0,
+    },
+    # Looks where objects pass, at 7 km/s.
+    {
+        "id": "watches",
+        "orbit": {"a_km": 6978.0, "i_deg": 60.0, "raan_deg": 4.0, "true_anomaly_deg": 3.0},
+        "camera": {"fov_deg": 15.0, "line_time_s": LINE_S},
+        "pointing": {"mode": "track", "place_km": [7372.8, 272.6, 41.4], "roll_deg": 20.0},
+        "magnitude_limit": 6.0,
+        "rate_hz": 5.0,
+    },
+]  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def log(tmp_path_factory):
+    defaults = {"detection": {"sigma_px": 0.15, "false_points": 5.0, "star_drop": 0.05},
+                "states": {"position_noise_km": 0.0, "position_bias_km": 0.0}}  # fmt: skip
+    target = {"orbit": SEEN, "count": 8, "spread_km": 40.0, "magnitude": [4.0, 5.5]}
+    scene = {"name": "rolling", "start": "2026-03-01T02:00:00Z", "duration_s": 12.0, "seed": 2,
+             "sensor_defaults": defaults, "sensors": SENSORS, "targets": [target]}  # fmt: skip
+    path = tmp_path_factory.mktemp("rolling") / "night.mcap"
+    simulate(validate_scene(scene, "test"), path)
+    return path
+
+
+def made_of(log, sensor_id, **assumed):
+    """Return what is identified of a sensor, its states and cameras."""
+    settings = Settings()
+    whole = read_whole([log], settings)
+    exposures, states = (
+        rows.filter(pa.compute.equal(rows["sensor_id"], sensor_id))
+        for rows in (whole.exposures, whole.states)
+    )
+    cameras = whole.cameras
+    if "line_time_s" in assumed:
+        at = cameras.schema.get_field_index("line_time_s")
+        stated = pa.array([assumed["line_time_s"]] * cameras.num_rows)
+        cameras = cameras.set_column(at, cameras.schema.field(at), stated)
+    frame_states = interpolate_sensor_states(exposures, states, settings.sensors)
+    catalogue = read_star_catalogue("hipparcos")
+    return identified(exposures, frame_states, cameras, catalogue, settings), cameras
+
+
+def true_frames(log, sensor_id):
+    frames = pl.read_parquet(f"{log}.truth/frames.parquet")
+    return frames.filter(pl.col("sensor_id") == sensor_id).sort("frame_number")
+
+
+def turns(solutions, frames):
+    """Return the errors of attitudes over their covariance: squares that should average 3."""
+    got, true = Rotation.from_quat(stack(solutions, "q{}", "xyzw")), Rotation.from_quat(
+        frames.select(f"q{a}" for a in "xyzw").to_numpy()
+    )  # fmt: skip
+    off = (got * true.inv()).as_rotvec() / ARCSEC
+    cov = stack_covariance(solutions, "cov_att_{}_arcsec2")
+    return np.einsum("ni,nij,nj->n", off, np.linalg.inv(cov), off)
+
+
+@pytest.mark.parametrize("sensor_id", ["spins", "watches"])
+def test_attitudes_are_right_and_honest(log, sensor_id):
+    found, _ = made_of(log, sensor_id)
+    frames = true_frames(log, sensor_id)
+    assert array(found.solutions, "attitude_source").tolist() == ["stars"] * len(frames)
+    square = turns(found.solutions, frames)
+    assert 2.0 < square.mean() < 4.2
+    assert np.sqrt(np.mean(array(found.stars, "dx_px") ** 2)) < 0.16
+    assert np.sqrt(np.mean(array(found.stars, "dy_px") ** 2)) < 0.16
+
+
+def test_without_the_line_time_stars_are_pixels_off(log):
+    found, _ = made_of(log, "spins", line_time_s=0.0)
+    off = np.hypot(array(found.stars, "dx_px"), array(found.stars, "dy_px"))
+    assert not len(off) or np.median(off) > 1.0
+
+
+def sights_of(log, **assumed):
+    """Return the table of the directions of objects, and which object each shows."""
+    found, cameras = made_of(log, "watches", **assumed)
+    settings = Settings()
+    made = tracked(found.solutions, found.detections, cameras, settings, found.stars)
+    seen = tabulate_sightings(
+        sight_objects(
+            found.solutions, made.detections, cameras, settings.tracklets,
+            settings.alignment.window_s,
+        )
+    )  # fmt: skip
+    points = pl.read_parquet(f"{log}.truth/points.parquet").filter(pl.col("kind") == 1)
+    keys = ["sensor_id", "frame_number", "centroid"]
+    points = points.with_columns(pl.col("frame_number", "centroid").cast(pl.Int64))
+    rows = pl.DataFrame(seen).with_row_index("row").with_columns(
+        pl.col("frame_number", "centroid").cast(pl.Int64)
+    ).join(points.select(*keys, "source"), on=keys)  # fmt: skip
+    return seen.take(rows["row"].to_numpy()), rows["source"].to_numpy()
+
+
+def errors(log, seen, source):
+    """Return the errors of directions by the true paths, and their sigmas [arcsec]."""
+    scenario = json.loads(Path(f"{log}.truth/scenario.json").read_text())
+    orbits = np.array([target["elements"] for target in scenario["targets"]])[source]
+    t_s, from_km = (array(seen, "time") - scenario["t0_ns"]) / 1e9, stack(seen, "{}_km")
+    u = unit_from_radec(*(np.radians(array(seen, f"{n}_deg")) for n in ("ra", "dec")))
+    light_s = np.zeros(len(t_s))
+    for _ in range(3):
+        r_km, _ = state_at(orbits, t_s - light_s)
+        light_s = np.linalg.norm(r_km - from_km, axis=1) / SPEED_OF_LIGHT_KM_S
+    d = r_km - from_km
+    off = (u - d / np.linalg.norm(d, axis=1, keepdims=True)) / ARCSEC
+    sigma = np.hypot(array(seen, "sigma_ra_arcsec"), array(seen, "sigma_dec_arcsec"))
+    return np.linalg.norm(off, axis=1), sigma
+
+
+def test_objects_are_where_they_were_when_their_rows_were_exposed(log):
+    seen, source = sights_of(log)
+    assert len(seen) > 300
+    late_ns = np.abs(array(seen, "time")[:, None] - true_frames(log, "watches")["t_ns"].to_numpy())
+    assert late_ns.min(axis=1).max() > 1e7  # rows are up to 50 ms before or after the frame
+    off, sigma = errors(log, seen, source)
+    assert 0.85 < np.mean(off**2 / sigma**2) < 1.15
+    # Without the line time, they are where they were at other times.
+    wrong, _ = errors(log, *sights_of(log, line_time_s=0.0))
+    assert np.mean(wrong**2) > 6 * np.mean(off**2)
+
+
+def test_a_line_time_can_be_assumed(log):
+    (piece, *_) = read_log_pieces(log)
+    assumed = Assumption(sensor="spins", line_time_s=2e-5)
+    lines = as_assumed(piece, [assumed]).cameras.select(["sensor_id", "line_time_s"]).to_pylist()
+    assert {row["sensor_id"]: row["line_time_s"] for row in lines} == {
+        "spins": 2e-5, "watches": LINE_S,
+    }  # fmt: skip
+
+
+# Rates from attitudes.
+
+RATE = np.array([0.01, -0.02, 0.005])
+
+
+def attitudes(t_s, rate=RATE):
+    first = Rotation.from_quat([0.1, 0.7, -0.3, 0.64])
+    return (Rotation.from_rotvec(np.outer(t_s, rate)) * first).as_matrix()
+
+
+def test_the_rate_of_a_sensor_that_turns_evenly_is_found_in_all_frames():
+    t_s = np.array([0.0, 0.4, 1.0, 1.3, 2.0, 2.1])
+    known = np.array([False, True, True, False, True, True])
+    R = attitudes(t_s)
+    R[~known] = np.nan
+    assert np.allclose(angular_rates(t_s, R, known), RATE, atol=1e-12)
+
+
+def test_a_jump_is_no_rate():
+    t_s = np.arange(6.0)
+    R = attitudes(t_s)
+    R[3:] = R[3:] @ Rotation.from_rotvec([0.3, 0.0, 0.0]).as_matrix()
+    assert np.allclose(angular_rates(t_s, R, np.ones(6, bool)), RATE, atol=1e-9)
+
+
+@pytest.mark.parametrize("t_s", [[0.0], [0.0, 60.0]])
+def test_frames_far_apart_tell_no_rate(t_s):
+    t_s = np.array(t_s)
+    assert not angular_rates(t_s, attitudes(t_s), np.ones(len(t_s), bool)).any()
+
+
+def test_directions_turn_as_the_attitude_does():
+    u = np.array([[0.6, 0.0, 0.8], [0.0, -0.28, 0.96]])
+    before, after = attitudes(np.array([0.0, 0.5]))
+    assert np.allclose(turned(u @ before.T, np.tile(0.5 * RATE, (2, 1))), u @ after.T, atol=1e-12)
