@@ -54,6 +54,7 @@ def publish_nights(
 # Slices of time: rows of a span from many parts, merged in slices that fit in memory.
 
 MAX_ROWS = 200_000  # in a slice, about
+MAX_SAMPLED = 1_000_000  # times of rows by which a span is divided
 ROWS_OF_TABLE = 200  # with many tables a slice has more rows: each table is opened for each slice
 
 
@@ -75,14 +76,15 @@ def in_slices(
     The slices depend on the times of the rows and the number of tables only. They have about as
     many rows each, wherever in the span these lie; rows of one time are never divided.
     """
-    times = [array(read(), column).copy() for read in tables]
-    orders = [None if (np.diff(t) >= 0).all() else np.argsort(t, kind="stable") for t in times]
-    edges = _edges(times, span, max(MAX_ROWS, ROWS_OF_TABLE * len(tables)))
-    cuts = [
-        np.searchsorted(t if order is None else t[order], edges)
-        for t, order in zip(times, orders, strict=True)
-    ]
-    del times
+    step = max(sum(read().num_rows for read in tables) // MAX_SAMPLED, 1)
+    sampled = [array(read(), column)[::step].copy() for read in tables]
+    edges = _edges(sampled, span, max(MAX_ROWS, ROWS_OF_TABLE * len(tables)) // step)
+    orders, cuts = [], []
+    for read in tables:
+        times = array(read(), column)
+        order = None if (np.diff(times) >= 0).all() else np.argsort(times, kind="stable")
+        orders.append(order)
+        cuts.append(np.searchsorted(times if order is None else times[order], edges))
     for k in range(len(edges) - 1):
         yield [
             _rows(read, order, int(cut[k]), int(cut[k + 1]))

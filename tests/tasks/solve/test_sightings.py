@@ -62,6 +62,31 @@ def sighting(source="stars", tracklet="t", flux=np.nan, cov_optics=None, **chang
     return sight_objects(solutions, detections, cameras, TrackletSettings(), HALF_WIDTH_S)
 
 
+def passing(rate_deg_s, error_s):
+    """Observations of an object that moves to the east; its times are off at random."""
+    rng = np.random.default_rng(4)
+    key = {
+        "sensor_id": ["s"] * N, "frame_number": np.arange(N),
+        "time": T0 + np.arange(N) * 100_000_000,
+    }  # fmt: skip
+    east = (np.arange(N) * 0.1 + rng.normal(0.0, error_s, N)) * rate_deg_s
+    error = rng.normal(0.0, CENTROID / 3600.0, (2, N))
+    solutions = filled(SOLUTIONS, N, key
+        | unstack("q{}", np.tile([0.0, 0.0, 0.0, 1.0], (N, 1)), "xyzw")
+        | unstack_covariance("cov_att_{}_arcsec2", np.zeros((N, 3, 3)))
+        | unstack("{}_km", np.tile([7000.0, 0.0, 0.0], (N, 1)))
+        | unstack("v{}_km_s", np.zeros((N, 3))) | {"attitude_source": ["stars"] * N}
+    )  # fmt: skip
+    detections = filled(DETECTIONS, N, key | {
+        "centroid": np.zeros(N, np.int32), "ra_deg": 30.0 + east + error[0], "dec_deg": error[1],
+        "sigma_arcsec": np.full(N, CENTROID), "kind": ["object"] * N, "tracklet_id": ["t"] * N,
+    })  # fmt: skip
+    cameras = cameras_of({"s": CAMERA}, None)
+    return tabulate_sightings(
+        sight_objects(solutions, detections, cameras, TrackletSettings(), HALF_WIDTH_S)
+    )
+
+
 def moved(seed, n=40_000):
     """East and north errors of the direction under random turns of the attitude [arcsec]."""
     rng = np.random.default_rng(seed)
@@ -98,6 +123,14 @@ def test_fitted_optics_are_shared():
     fitted = array(sighted("prior", cov_optics=principal_point), "bias_sigma_arcsec")
     pixel_arcsec = 1 / 3000 / ARCSEC
     assert np.sqrt(fitted**2 - told**2) == pytest.approx(np.full(N, 2 * pixel_arcsec), rel=0.05)
+
+
+def test_the_error_of_a_trail_is_along_the_motion():
+    rows = passing(3.0, 2e-3)
+    along, across = (array(rows, f"sigma_{axis}_arcsec") for axis in ("ra", "dec"))
+    assert across == pytest.approx(CENTROID, rel=1e-3)
+    assert np.mean(along) == pytest.approx(np.hypot(3.0 * 3600.0 * 2e-3, CENTROID), rel=0.25)
+    assert array(passing(3.0, 0.0), "sigma_ra_arcsec") == pytest.approx(CENTROID, rel=1e-3)
 
 
 def test_the_sensors_aberration_is_removed():
