@@ -1,8 +1,8 @@
 """Tracklet sightings: one sensor's detections by tracklet, with errors that the log does not state.
 
 The detections together show three errors: the part of a prior attitude's error that changes from
-frame to frame, that of a trail along its motion, and the shift of a centroid by the light of a
-neighbour.
+frame to frame, that of a trail along its motion in the sky or in the image, and the shift of a
+centroid by the light of a neighbour.
 """
 
 from typing import NamedTuple
@@ -31,9 +31,11 @@ from epipole.tasks.algorithms.geometry.directions import (
     matrix_from_quaternion,
     radec_from_unit,
 )
+from epipole.tasks.algorithms.geometry.turning import angular_rates
 from epipole.tasks.algorithms.photometry import FluxScale
 from epipole.tasks.algorithms.tracking.attributables import attributables
 from epipole.tasks.algorithms.tracking.blends import TrackedDetections, blend_variance, of_neighbour
+from epipole.tasks.algorithms.tracking.image_trails import trail_time2
 from epipole.tasks.algorithms.tracking.local_motion import directions_at
 from epipole.tasks.algorithms.tracking.trails import AlongMotion, along_motion, time_error
 from epipole.tasks.common.grouping import factorize, group_offsets
@@ -118,6 +120,7 @@ def sight_objects(
     camera = camera_of(cameras, row)
     tracklets = _with_split_prior(_by_tracklet(frames, tracked, cameras), frames, half_width_s)
     tracklets = _with_trails(tracklets, frames)
+    tracklets = _with_image_trails(tracklets, frames, half_width_s)
     tracklets = _with_blends(tracklets, frames, camera)
     return SensorSightings(frames, tracklets, camera, optics_covariance_of(cameras, row))
 
@@ -288,6 +291,32 @@ def _with_trails(tracklets: TrackletSightings, frames: Frames) -> TrackletSighti
     error = motion.along * (motion.rate_rad_s * time_error(motion, variance))[:, None]
     noise[rows] += error[:, :, None] * error[:, None, :]
     return tracklets._replace(cov_noise=noise)
+
+
+def _with_image_trails(
+    tracklets: TrackletSightings, frames: Frames, half_width_s: float
+) -> TrackletSightings:
+    """Return the sightings with the error along their motion through the image that their scatter
+    shows beyond the other errors, see `image_trails`."""
+    v = np.nan_to_num(frames.v_gcrf_km_s)
+    u = aberrate(tracklets.u_icrs, -v[tracklets.frame])
+    time_s, tracklet = (tracklets.time_ns - frames.time_ns[0]) / 1e9, tracklets.tracklet
+    fit = directions_at(
+        tracklets.bounds[tracklet], tracklets.bounds[tracklet + 1], time_s, 0.0, time_s, u,
+        tracklets.cov_noise, tracklets.cov_bias, half_width_s,
+    )  # fmt: skip
+    variance = np.trace(tracklets.cov_noise, axis1=1, axis2=2) / 2
+    leverage = (np.trace(fit.cov_noise, axis1=1, axis2=2) / 2 - fit.unmodelled) / variance
+    R = matrix_from_quaternion(frames.q_sensor_from_icrs)
+    rates = angular_rates((frames.time_ns - frames.time_ns[0]) / 1e9, R, np.ones(len(R), bool))
+    R, turns = R[tracklets.frame], rates[tracklets.frame]
+    by_turn = np.cross(turns, np.einsum("nij,nj->ni", R, u))
+    moves = fit.w + np.einsum("nji,nj->ni", R, by_turn)
+    time2 = trail_time2(u - fit.u, moves, tracklets.cov_noise, leverage)
+    if not time2:
+        return tracklets
+    along = moves[:, :, None] * moves[:, None, :]
+    return tracklets._replace(cov_noise=tracklets.cov_noise + time2 * along)
 
 
 # Tables of observations and attributables.

@@ -1,29 +1,19 @@
 """Rolling shutter: attitudes, stars and directions of objects against a simulated truth."""
 
-import json
-from pathlib import Path
-
 import numpy as np
 import polars as pl
-import pyarrow as pa
 import pytest
-from scenes.identified import identified, tracked
-from scenes.whole_logs import read_whole
+from scenes.watched_objects import errors, made_of, sights_of
 from scipy.spatial.transform import Rotation
 
 from epipole.flows.simulate import simulate
-from epipole.io.catalogues.star_catalogue import read_star_catalogue
 from epipole.io.logs.reader import read_log_pieces
 from epipole.schemas.bridge import array, stack, stack_covariance
 from epipole.schemas.scene import validate_scene
-from epipole.schemas.settings import Assumption, Settings
-from epipole.tasks.algorithms.constants import ARCSEC, SPEED_OF_LIGHT_KM_S
-from epipole.tasks.algorithms.geometry.directions import unit_from_radec
+from epipole.schemas.settings import Assumption
+from epipole.tasks.algorithms.constants import ARCSEC
 from epipole.tasks.algorithms.geometry.turning import angular_rates, turned
-from epipole.tasks.algorithms.simulation.paths import state_at
-from epipole.tasks.identify.frame_inputs import interpolate_sensor_states
 from epipole.tasks.read.assume_readings import as_assumed
-from epipole.tasks.solve.sightings import sight_objects, tabulate_sightings
 
 LINE_S = 1e-4  # an image of 1024 rows takes a tenth of a second
 SEEN = {"a_km": 7378.0, "i_deg": 70.0, "raan_deg": 2.0, "true_anomaly_deg": 0.0}
@@ -62,24 +52,6 @@ def log(tmp_path_factory):
     return path
 
 
-def made_of(log, sensor_id, **assumed):
-    """Return what is identified of a sensor, its states and cameras."""
-    settings = Settings()
-    whole = read_whole([log], settings)
-    exposures, states = (
-        rows.filter(pa.compute.equal(rows["sensor_id"], sensor_id))
-        for rows in (whole.exposures, whole.states)
-    )
-    cameras = whole.cameras
-    if "line_time_s" in assumed:
-        at = cameras.schema.get_field_index("line_time_s")
-        stated = pa.array([assumed["line_time_s"]] * cameras.num_rows)
-        cameras = cameras.set_column(at, cameras.schema.field(at), stated)
-    frame_states = interpolate_sensor_states(exposures, states, settings.sensors)
-    catalogue = read_star_catalogue("hipparcos")
-    return identified(exposures, frame_states, cameras, catalogue, settings), cameras
-
-
 def true_frames(log, sensor_id):
     frames = pl.read_parquet(f"{log}.truth/frames.parquet")
     return frames.filter(pl.col("sensor_id") == sensor_id).sort("frame_number")
@@ -112,51 +84,15 @@ def test_without_the_line_time_stars_are_pixels_off(log):
     assert not len(off) or np.median(off) > 1.0
 
 
-def sights_of(log, **assumed):
-    """Return the table of the directions of objects, and which object each shows."""
-    found, cameras = made_of(log, "watches", **assumed)
-    settings = Settings()
-    made = tracked(found.solutions, found.detections, cameras, settings, found.stars)
-    seen = tabulate_sightings(
-        sight_objects(
-            found.solutions, made.detections, cameras, settings.tracklets,
-            settings.alignment.window_s,
-        )
-    )  # fmt: skip
-    points = pl.read_parquet(f"{log}.truth/points.parquet").filter(pl.col("kind") == 1)
-    keys = ["sensor_id", "frame_number", "centroid"]
-    points = points.with_columns(pl.col("frame_number", "centroid").cast(pl.Int64))
-    rows = pl.DataFrame(seen).with_row_index("row").with_columns(
-        pl.col("frame_number", "centroid").cast(pl.Int64)
-    ).join(points.select(*keys, "source"), on=keys)  # fmt: skip
-    return seen.take(rows["row"].to_numpy()), rows["source"].to_numpy()
-
-
-def errors(log, seen, source):
-    """Return the errors of directions by the true paths, and their sigmas [arcsec]."""
-    scenario = json.loads(Path(f"{log}.truth/scenario.json").read_text())
-    orbits = np.array([target["elements"] for target in scenario["targets"]])[source]
-    t_s, from_km = (array(seen, "time") - scenario["t0_ns"]) / 1e9, stack(seen, "{}_km")
-    u = unit_from_radec(*(np.radians(array(seen, f"{n}_deg")) for n in ("ra", "dec")))
-    light_s = np.zeros(len(t_s))
-    for _ in range(3):
-        r_km, _ = state_at(orbits, t_s - light_s)
-        light_s = np.linalg.norm(r_km - from_km, axis=1) / SPEED_OF_LIGHT_KM_S
-    d = r_km - from_km
-    off = (u - d / np.linalg.norm(d, axis=1, keepdims=True)) / ARCSEC
-    sigma = np.hypot(array(seen, "sigma_ra_arcsec"), array(seen, "sigma_dec_arcsec"))
-    return np.linalg.norm(off, axis=1), sigma
-
-
 def test_objects_are_where_they_were_when_their_rows_were_exposed(log):
-    seen, source = sights_of(log)
+    seen, source = sights_of(log, "watches")
     assert len(seen) > 300
     late_ns = np.abs(array(seen, "time")[:, None] - true_frames(log, "watches")["t_ns"].to_numpy())
     assert late_ns.min(axis=1).max() > 1e7  # rows are up to 50 ms before or after the frame
     off, sigma = errors(log, seen, source)
     assert 0.85 < np.mean(off**2 / sigma**2) < 1.15
     # Without the line time, they are where they were at other times.
-    wrong, _ = errors(log, *sights_of(log, line_time_s=0.0))
+    wrong, _ = errors(log, *sights_of(log, "watches", line_time_s=0.0))
     assert np.mean(wrong**2) > 6 * np.mean(off**2)
 
 
