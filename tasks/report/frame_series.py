@@ -58,8 +58,9 @@ def clock(time_ns: int) -> str:
 
 Array = npt.NDArray[np.float64]
 
-COLUMNS = ["time", "sensor_id", "attitude_source", "status", "n_stars", "sigma_x_arcsec",
-           "sigma_y_arcsec", "sigma_z_arcsec", "residual_px"]  # fmt: skip
+COLUMNS = ["time", "sensor_id", "attitude_source", "status", "n_stars", "n_centroids",
+           "sigma_x_arcsec", "sigma_y_arcsec", "sigma_z_arcsec", "residual_px"]  # fmt: skip
+FEW_CENTROIDS = 4.0  # in a frame, on average: with fewer, what is sent are no stars
 SOURCES = ("stars", "prior", "none")
 GAP_FRAMES = 10  # a time without frames that is this many frame intervals long is a gap
 SHORTEST_GAP_S = 5.0
@@ -91,6 +92,7 @@ class FrameSeries:
     gaps : the longest ones, of all sensors, in order of time
     lost_s : the length of all gaps, by sensor
     stars : the mean number of stars of an identified frame, by sensor
+    centroids : the mean number of centroids of a frame, by sensor
     """
 
     sensors: list[str]
@@ -101,6 +103,7 @@ class FrameSeries:
     gaps: list[Gap]
     lost_s: Array
     stars: Array
+    centroids: Array
 
     @property
     def frames(self) -> Indices:
@@ -113,6 +116,12 @@ class FrameSeries:
         """The share of each sensor's frames that are identified."""
         share: Array = self.counts[0].sum(axis=1) / np.maximum(self.frames, 1)
         return share
+
+    @property
+    def sends_no_stars(self) -> npt.NDArray[np.bool_]:
+        """Which sensors send attitudes in place of stars, and hardly a centroid."""
+        by_source = self.counts.sum(axis=2)
+        return (by_source[1] == self.frames) & (self.centroids < FEW_CENTROIDS)
 
 
 def read_frame_series(night: NightReader) -> FrameSeries | None:
@@ -142,7 +151,7 @@ class _SeriesSums:
         self.failed: dict[tuple[str, str], int] = {}
         self.gaps: list[Gap] = []
         self.lost_s = np.zeros(len(sensors))
-        self.stars = np.zeros(len(sensors))
+        self.stars, self.centroids = np.zeros((2, len(sensors)))
         self.last_ns = np.full(len(sensors), -1, np.int64)
         self.interval_ns = np.zeros(len(sensors))
 
@@ -153,13 +162,14 @@ class _SeriesSums:
         time_ns = rows["time"].dt.epoch("ns").to_numpy()
         bin_ = self.bins.of(time_ns)
         np.add.at(self.counts, (source, sensor, bin_), 1)
-        x, y, z, residual = (rows[name].to_numpy() for name in COLUMNS[5:])
+        x, y, z, residual = (rows[name].to_numpy() for name in COLUMNS[6:])
         for name, square in (("across", (x * x + y * y) / 2), ("about", z * z),
                              ("residual", residual * residual)):  # fmt: skip
             known = np.isfinite(square)
             np.add.at(self.squares[name], (sensor[known], bin_[known]), square[known])
             np.add.at(self.numbers[name], (sensor[known], bin_[known]), 1)
         self.stars += np.bincount(sensor, rows["n_stars"].to_numpy(), len(self.sensors))
+        self.centroids += np.bincount(sensor, rows["n_centroids"].to_numpy(), len(self.sensors))
         failed = rows.filter(pl.col("status").is_not_null()).group_by("sensor_id", "status").len()
         for name, status, count in failed.iter_rows():
             self.failed[name, status] = self.failed.get((name, status), 0) + count
@@ -188,9 +198,11 @@ class _SeriesSums:
         with np.errstate(invalid="ignore", divide="ignore"):
             rms = {name: np.sqrt(self.squares[name] / self.numbers[name]) for name in SUMS}
             stars = self.stars / self.counts[0].sum(axis=1)
+        centroids = self.centroids / np.maximum(self.counts.sum(axis=(0, 2)), 1)
         gaps = sorted(self.gaps, key=lambda gap: (gap.start_ns, gap.sensor_id))
         return FrameSeries(self.sensors, self.bins, self.counts, rms,
-                           dict(sorted(self.failed.items())), gaps, self.lost_s, stars)  # fmt: skip
+                           dict(sorted(self.failed.items())), gaps, self.lost_s, stars,
+                           centroids)  # fmt: skip
 
 
 def codes(names: pl.Series, known: list[str]) -> Indices:

@@ -8,6 +8,7 @@ from statistics import median
 from typing import NamedTuple
 
 import numpy as np
+import numpy.typing as npt
 import polars as pl
 
 from epipole.io.datasets.night_tables import NightReader
@@ -178,7 +179,7 @@ def _concerned(
     """Return a frame of each sensor whose share identified or residuals need a look."""
     if series is None:
         return {}
-    wrong = {series.sensors[k] for k in np.flatnonzero(series.identified_share < MIN_IDENTIFIED)}
+    wrong = {series.sensors[k] for k in np.flatnonzero(_is_poor(series))}
     if residuals is not None:
         wrong |= {name for name, _ in _residuals_off(residuals)}
     order = sorted(wrong, key=lambda name: series.identified_share[series.sensors.index(name)])
@@ -225,7 +226,7 @@ def _faults(facts: NightFacts) -> Iterator[Look]:
 def _nothing_found(facts: NightFacts) -> Iterator[Look]:
     if facts.series is None:
         yield Look("The night has no frames.", "coverage")
-    elif not facts.series.counts[0].any():
+    elif not (facts.series.counts[0].any() or facts.series.sends_no_stars.all()):
         yield Look("No star is identified in the whole night.", "coverage")
     elif not facts.objects:
         yield Look("No object is found.", "sky")
@@ -235,11 +236,15 @@ def _sensors(facts: NightFacts) -> Iterator[Look]:
     series = facts.series
     if series is None:
         return
-    for k, name in enumerate(series.sensors):
-        share = series.identified_share[k]
-        if share < MIN_IDENTIFIED:
-            identified = f"{percent(share)} of its frames are identified{_why(series, name)}"
-            yield Look(f"{name}: {identified}.", _frame_of(facts, name, "coverage"))
+    for k in np.flatnonzero(_is_poor(series)).tolist():
+        name, share = series.sensors[k], series.identified_share[k]
+        identified = f"{percent(share)} of its frames are identified{_why(series, name)}"
+        yield Look(f"{name}: {identified}.", _frame_of(facts, name, "coverage"))
+
+
+def _is_poor(series: FrameSeries) -> npt.NDArray[np.bool_]:
+    """Return which sensors' frames are identified more rarely than they should be."""
+    return (series.identified_share < MIN_IDENTIFIED) & ~series.sends_no_stars
 
 
 def _frame_of(facts: NightFacts, name: str, otherwise: str) -> str:

@@ -1,6 +1,7 @@
 """Frames over the night: what they became, gaps, and sums that do not depend on the pieces."""
 
 import numpy as np
+import pytest
 from scenes.made_nights import START_NS, filled, reader_of, seconds
 
 from epipole.tasks.report.frame_series import read_frame_series
@@ -61,3 +62,12 @@ def test_pieces_of_a_table_change_nothing():
 
 def test_a_night_without_frames_has_no_series():
     assert read_frame_series(reader_of({})) is None
+
+
+@pytest.mark.parametrize(
+    ("source", "centroids", "no_stars"), [("prior", 1, True), ("prior", 30, False), ("none", 1, 0)]
+)
+def test_a_sensor_that_sends_attitudes_and_no_stars_is_known(source, centroids, no_stars):
+    frames = filled("frames", time=seconds(50), sensor_id=["a"] * 50,
+                    attitude_source=[source] * 50, n_centroids=[centroids] * 50)  # fmt: skip
+    assert read_frame_series(reader_of({"frames": frames})).sends_no_stars.tolist() == [no_stars]
