@@ -12,7 +12,7 @@ from epipole.io.catalogues.earth_orientation import read_earth_orientation
 from epipole.io.logs.writer import LogWriter
 from epipole.schemas.bridge import from_polars, to_polars
 from epipole.schemas.work_tables import CAMERAS, EXPOSURES, LOG_STATES
-from epipole.tasks.algorithms.orbits.reference_frames import orientation_at
+from epipole.tasks.algorithms.orbits.reference_frames import orientation_at, tt_julian_date
 from scenes.altered_logs import frame_values, state_values, table_rows
 
 R = ["x_km", "y_km", "z_km"]
@@ -104,11 +104,9 @@ def turned(back, label):
         chosen = rows["sensor_id"].is_in(list(names)).to_numpy()
         time_ns = rows["time"].cast(pl.Int64).to_numpy()
         r, v = rows.select(R).to_numpy().copy(), rows.select(V).to_numpy().copy()
-        angle = erfa.era00(*orientation_at(time_ns, *read_earth_orientation()).ut1)
-        angle = -angle if back else angle
-        turn = np.zeros((len(angle), 3, 3))
-        turn[:, 0, 0] = turn[:, 1, 1] = np.cos(angle)
-        turn[:, 0, 1], turn[:, 1, 0], turn[:, 2, 2] = np.sin(angle), -np.sin(angle), 1.0
+        at = orientation_at(time_ns, *read_earth_orientation())
+        turn = erfa.c2t06a(*tt_julian_date(time_ns), *at.ut1, at.xp_rad, at.yp_rad)
+        turn = np.swapaxes(turn, 1, 2) if back else turn
         w = np.array([0, 0, EARTH_RATE_RAD_S])
         if back:
             v += np.cross(w, r)
