@@ -56,6 +56,8 @@ Indices = npt.NDArray[np.int64]
 # Tracklets that show the error of a trail: of this rate [rad/s], at which the 2 ms of a simulated
 # tracker are a twentieth of its centroid's error, and five detections at least.
 TRAIL_RAD_S, MIN_TRAILS = np.radians(0.1), 5
+# And those that show one in the image: slower ones leave trails of a tenth of a pixel or two.
+IMAGE_TRAIL_RAD_S = np.radians(0.02)
 
 
 class TrackletSightings(NamedTuple):
@@ -298,25 +300,40 @@ def _with_image_trails(
 ) -> TrackletSightings:
     """Return the sightings with the error along their motion through the image that their scatter
     shows beyond the other errors, see `image_trails`."""
+    R = matrix_from_quaternion(frames.q_sensor_from_icrs)
+    frame_s = (frames.time_ns - frames.time_ns[0]) / 1e9
+    time_s, tracklet = (tracklets.time_ns - frames.time_ns[0]) / 1e9, tracklets.tracklet
+    in_image = np.einsum("nij,nj->ni", R[tracklets.frame], tracklets.u_icrs)
+    rows = _that_move(in_image, time_s, tracklets.bounds)
+    if not len(rows):
+        return tracklets
     v = np.nan_to_num(frames.v_gcrf_km_s)
     u = aberrate(tracklets.u_icrs, -v[tracklets.frame])
-    time_s, tracklet = (tracklets.time_ns - frames.time_ns[0]) / 1e9, tracklets.tracklet
     fit = directions_at(
-        tracklets.bounds[tracklet], tracklets.bounds[tracklet + 1], time_s, 0.0, time_s, u,
-        tracklets.cov_noise, tracklets.cov_bias, half_width_s,
+        tracklets.bounds[tracklet[rows]], tracklets.bounds[tracklet[rows] + 1], time_s[rows], 0.0,
+        time_s, u, tracklets.cov_noise, tracklets.cov_bias, half_width_s,
     )  # fmt: skip
-    variance = np.trace(tracklets.cov_noise, axis1=1, axis2=2) / 2
+    noise = tracklets.cov_noise[rows]
+    variance = np.trace(noise, axis1=1, axis2=2) / 2
     leverage = (np.trace(fit.cov_noise, axis1=1, axis2=2) / 2 - fit.unmodelled) / variance
-    R = matrix_from_quaternion(frames.q_sensor_from_icrs)
-    rates = angular_rates((frames.time_ns - frames.time_ns[0]) / 1e9, R, np.ones(len(R), bool))
-    R, turns = R[tracklets.frame], rates[tracklets.frame]
-    by_turn = np.cross(turns, np.einsum("nij,nj->ni", R, u))
-    moves = fit.w + np.einsum("nji,nj->ni", R, by_turn)
-    time2 = trail_time2(u - fit.u, moves, tracklets.cov_noise, leverage)
+    frame = tracklets.frame[rows]
+    by_turn = np.cross(angular_rates(frame_s, R, np.ones(len(R), bool))[frame], in_image[rows])
+    moves = fit.w + np.einsum("nji,nj->ni", R[frame], by_turn)
+    time2 = trail_time2(u[rows] - fit.u, moves, noise, leverage)
     if not time2:
         return tracklets
-    along = moves[:, :, None] * moves[:, None, :]
-    return tracklets._replace(cov_noise=tracklets.cov_noise + time2 * along)
+    with_trails = tracklets.cov_noise.copy()
+    with_trails[rows] += time2 * moves[:, :, None] * moves[:, None, :]
+    return tracklets._replace(cov_noise=with_trails)
+
+
+def _that_move(in_image: Array, time_s: Array, bounds: Indices) -> Indices:
+    """Return the rows of the tracklets that move through the image by `IMAGE_TRAIL_RAD_S`."""
+    moved = np.linalg.norm(np.diff(in_image, axis=0), axis=1)
+    way = np.concatenate([[0.0], np.cumsum(moved)])
+    first, last = bounds[:-1], bounds[1:] - 1
+    fast = way[last] - way[first] > IMAGE_TRAIL_RAD_S * (time_s[last] - time_s[first])
+    return np.flatnonzero(np.repeat(fast, np.diff(bounds)))
 
 
 # Tables of observations and attributables.
