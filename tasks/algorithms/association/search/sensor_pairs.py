@@ -2,7 +2,9 @@
 
 1. `meeting_pairs` finds the sensors whose fields overlap. In crowded space each sensor is paired
    with a limited number of others.
-2. `SensorPairs` puts the longest baselines first, and skips a pair where earlier pairs cover all
+2. `passing_pairs` finds those of which two tracklets' lines of sight pass near each other, of any
+   number of sensors with few tracklets each: all round the Earth, thousands of fields overlap.
+3. `SensorPairs` puts the longest baselines first, and skips a pair where earlier pairs cover all
    the space that it shares. With few sensors, `EveryPair` takes all of them.
 """
 
@@ -18,7 +20,17 @@ from epipole.tasks.algorithms.association.search.field_index import (
     ground_range,
 )
 from epipole.tasks.algorithms.association.search.seeds import SHORTEST_BASELINE_KM
-from epipole.tasks.algorithms.association.views import PLANE, Views, X, Y, direction
+from epipole.tasks.algorithms.association.views import (
+    PLANE,
+    SIGMA_KM,
+    XX,
+    YY,
+    Views,
+    X,
+    Y,
+    direction,
+)
+from epipole.tasks.algorithms.constants import EARTH_RADIUS_KM
 from epipole.tasks.algorithms.kernels import borrowing_kernel, kernel
 
 Array = npt.NDArray[np.float64]
@@ -31,6 +43,9 @@ N_LEADERS = 8  # sensors of a crowded cell with which all others there are paire
 MAX_OVERLAPPING = 64  # maximum number of others that a sensor is paired with, half of them leaders
 MAX_TESTS = 512  # maximum number of tests per sensor of whether two fields overlap
 FEW_TRACKLETS = 8  # of a sensor in a window: seeding with fewer costs next to nothing
+# Lines of sight pass near each other within this angle, distance, and number of sigmas together:
+# far more than what is one object misses by, and few others do.
+PASSING_RAD, PASSING_KM, PASSING_SIGMA = 5e-3, 20.0, 5.0
 N_EDGES = 8  # outermost tracklets of a sensor, one for each of the axes on its plane
 # Share of a crowded field that counts as covered by a pair: its edges are left out.
 MIDDLE_SHARE = 0.5
@@ -180,6 +195,89 @@ def _leaders(index, rank):
     return leader
 
 
+# Pairs of sensors with few tracklets
+
+
+def passing_pairs(views: Views, sparse: Flags, farthest_km: float) -> tuple[Indices, Indices]:
+    """Return pairs of sensors of which two tracklets' lines of sight pass near each other.
+
+    Each pair once; the first has the lower number. Only `sparse` sensors (s,) take part: lines of
+    sight are compared each with each.
+    """
+    a, b = np.unique(_passing(views, sparse, farthest_km), axis=0).T
+    return a, b
+
+
+def _together(
+    one: tuple[Indices, Indices], other: tuple[Indices, Indices], n_sensors: int
+) -> tuple[Indices, Indices]:
+    """Return the pairs of both, in order."""
+    key = np.union1d(*(a * n_sensors + b for a, b in (one, other)))
+    return key // n_sensors, key % n_sensors
+
+
+@kernel
+def _passing(views, sparse, farthest_km):
+    """Return pairs of sensors, (n, 2); some of them twice."""
+    n_tracklets, n = len(views.sensor), 0
+    row, u = np.empty(n_tracklets, np.int64), np.empty((n_tracklets, 3))
+    sigma, out = np.empty((n_tracklets, 2)), np.empty((64, 2), np.int64)
+    for m in range(len(views.time_s)):
+        count = 0
+        for i in range(n_tracklets):
+            if sparse[views.sensor[i]] and views.seen[i, m]:
+                direction(views, i, m, u[count])
+                row[count], sigma[count, 1] = i, views.sight[i, m, SIGMA_KM]
+                sigma[count, 0] = np.sqrt(views.sight[i, m, XX] + views.sight[i, m, YY])
+                count += 1
+        for p in range(count):
+            i = row[p]
+            for q in range(p + 1, count):
+                j, a, b = row[q], views.sensor[i], views.sensor[row[q]]
+                if a == b or (m > 0 and views.seen[i, m - 1] and views.seen[j, m - 1]):
+                    continue  # they were compared at the instant before
+                rad = PASSING_RAD + PASSING_SIGMA * (sigma[p, 0] + sigma[q, 0])
+                km = PASSING_KM + PASSING_SIGMA * (sigma[p, 1] + sigma[q, 1])
+                if not _pass_near(
+                    views.camera[a, m], u[p], views.camera[b, m], u[q], rad, km, farthest_km
+                ):
+                    continue
+                if n == len(out):
+                    longer = np.empty((2 * n, 2), np.int64)
+                    longer[:n] = out
+                    out = longer
+                out[n, 0], out[n, 1] = a, b
+                n += 1
+    return out[:n]
+
+
+@borrowing_kernel
+def _pass_near(camera_a, u_a, camera_b, u_b, rad, km, farthest_km):
+    """Return whether two lines of sight pass within some angle and distance, above the ground.
+
+    Nearly parallel lines always do.
+    """
+    cosine, along_a, along_b = 0.0, 0.0, 0.0
+    for x in range(3):
+        d = camera_b[x] - camera_a[x]
+        cosine += u_a[x] * u_b[x]
+        along_a += d * u_a[x]
+        along_b += d * u_b[x]
+    sine2 = 1.0 - cosine * cosine
+    if sine2 < 4.0 * rad * rad:
+        return cosine > 0.0
+    range_a, range_b = (along_a - cosine * along_b) / sine2, (cosine * along_a - along_b) / sine2
+    if not (0.0 < range_a < farthest_km and 0.0 < range_b < farthest_km):  # false for NaN
+        return False
+    gap2, radius2 = 0.0, 0.0
+    for x in range(3):
+        at_a, at_b = camera_a[x] + range_a * u_a[x], camera_b[x] + range_b * u_b[x]
+        gap2 += (at_b - at_a) ** 2
+        radius2 += at_a * at_a
+    allowed = rad * max(range_a, range_b) + km
+    return gap2 < allowed * allowed and radius2 > EARTH_RADIUS_KM**2
+
+
 # Order of the pairs
 
 
@@ -215,12 +313,16 @@ class SensorPairs:
     def __init__(self, views: Views, farthest_km: float, index: FieldIndex, cones: Array) -> None:
         look, position, half, edges = _middle(views, N_EDGES)
         a, b = meeting_pairs(index, cones, farthest_km)
+        n_overlapping = np.bincount(np.append(a, b), minlength=len(look))
+        sparse = sparse_sensors(views)
+        dense = ~(sparse[a] & sparse[b])
+        passing = passing_pairs(views, sparse, farthest_km)
+        a, b = _together((a[dense], b[dense]), passing, len(look))
         baseline = position[b] - position[a]
         known = np.linalg.norm(baseline, axis=1) > SHORTEST_BASELINE_KM  # false for NaN
         across = np.linalg.norm(np.cross(baseline, look[a] + look[b]), axis=1) / 2
         order = np.flatnonzero(known)[np.argsort(-across[known], kind="stable")]
         self._a, self._b = a[order], b[order]
-        n_overlapping = np.bincount(np.append(a, b), minlength=len(look))
         middle, many = (look, position, half), n_overlapping > FEW_SENSORS
         few = ~many[self._a] & ~many[self._b]
         self._points = np.full((len(order), 1 + N_EDGES, 3), np.nan)
@@ -230,7 +332,6 @@ class SensorPairs:
         )
         self._share = np.where(few, 1.0, MIDDLE_SHARE)
         self._look, self._position, self._half = middle
-        sparse = sparse_sensors(views)
         self._always = sparse[self._a] & sparse[self._b]
         self._waiting = np.ones(len(order), bool)
         self._busy = np.zeros(len(look), bool)
