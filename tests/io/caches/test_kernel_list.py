@@ -19,10 +19,12 @@ pytestmark = pytest.mark.long
 ROOT = Path(__file__).parents[3]
 EXAMPLE = ROOT / "examples" / "four_sensor_geo.mcap"
 ELEMENTS = ROOT / "io" / "simulation" / "built_in" / "real_leo.tle"
-# Scenes that use what the example does not: attitudes from scratch; many sensors, known objects.
+# Scenes that use what the example does not: attitudes from scratch; many sensors, known objects;
+# stars among many satellites.
 SCENES = {
     "wide": ("six_sensor_wide", "--seconds", "2"),
     "passing": ("constellation", "--satellites", "10", "--near", "--seconds", "40"),
+    "crowd": ("night", "--sensors", "2", "--objects", "60", "--seconds", "12"),
 }
 
 _HEAD = """\
@@ -83,9 +85,9 @@ def recorded(self, types):
 
 Dispatcher.compile = recorded
 from epipole.flows.command_line.main import main
-example, wide, passing, elements, called = sys.argv[1:]
+example, wide, crowd, passing, elements, called = sys.argv[1:]
 try:
-    for k, arguments in enumerate(([example], [wide], [passing, "--known", elements])):
+    for k, arguments in enumerate(([example], [wide], [crowd], [passing, "--known", elements])):
         sys.argv = ["epipole", "run", *arguments, "--out", f"{called}.{k}", "--quiet"]
         try:
             main()
@@ -110,8 +112,8 @@ def kernels_of_runs(folder):
         command = [sys.executable, "-c", SIMULATE, "simulate", *scene, "--out", logs[name]]
         subprocess.run(command, check=True, stdout=subprocess.DEVNULL)
     called = Path(folder) / "called"
-    command = [sys.executable, "-c", RUN, EXAMPLE, logs["wide"], logs["passing"], ELEMENTS, called]
-    subprocess.run(command, check=True, cwd=folder)
+    files = [EXAMPLE, *(logs[name] for name in ("wide", "crowd", "passing")), ELEMENTS, called]
+    subprocess.run([sys.executable, "-c", RUN, *files], check=True, cwd=folder)
     return pickle.loads(called.read_bytes())
 
 
