@@ -246,25 +246,10 @@ def _with_split_prior(
     prior = np.flatnonzero(~frames.from_stars[tracklets.frame])
     if not len(prior):
         return tracklets
-    v = np.nan_to_num(frames.v_gcrf_km_s)
-    u = aberrate(tracklets.u_icrs, -v[tracklets.frame])
-    noise_rad2 = np.trace(tracklets.cov_noise, axis1=1, axis2=2)[prior] / 2
+    about = _about_motion(tracklets, frames, prior, half_width_s)
     tracklet = tracklets.tracklet[prior]
-    time_s = (tracklets.time_ns - frames.time_ns[0]) / 1e9
-    fit = directions_at(
-        tracklets.bounds[tracklet],
-        tracklets.bounds[tracklet + 1],
-        time_s[prior],
-        0.0,
-        time_s,
-        u,
-        tracklets.cov_noise,
-        tracklets.cov_bias,
-        half_width_s,
-    )
-    leverage = (np.trace(fit.cov_noise, axis1=1, axis2=2) / 2 - fit.unmodelled) / noise_rad2
     follows = np.append(False, (np.diff(tracklet) == 0) & (np.diff(prior) == 1))
-    scatter = scatter_beyond(u[prior] - fit.u, np.sqrt(noise_rad2), leverage, follows)
+    scatter = scatter_beyond(about.miss, np.sqrt(about.noise_rad2), about.leverage, follows)
     stated = np.trace(tracklets.cov_bias, axis1=1, axis2=2)[prior] / 2
     share = scatter / np.maximum(stated, 1e-30)
     n_frames = len(np.unique(tracklets.frame[prior]))
@@ -273,6 +258,37 @@ def _with_split_prior(
     noise[prior] += share[:, None, None] * bias[prior]
     bias[prior] *= stays[:, None, None]
     return tracklets._replace(cov_noise=noise, cov_bias=bias)
+
+
+class _AboutMotion(NamedTuple):
+    """Some sightings about the smooth motions of their tracklets.
+
+    miss : (n, 3) float, directions minus those of the motions [rad]
+    w : (n, 3) float, rates of the motions [rad/s]
+    noise_rad2 : (n,) float, variances of the directions per axis
+    leverage : (n,) float, weights of the directions in the motions
+    """
+
+    miss: Array
+    w: Array
+    noise_rad2: Array
+    leverage: Array
+
+
+def _about_motion(
+    tracklets: TrackletSightings, frames: Frames, rows: Indices, half_width_s: float
+) -> _AboutMotion:
+    v = np.nan_to_num(frames.v_gcrf_km_s)
+    u = aberrate(tracklets.u_icrs, -v[tracklets.frame])
+    tracklet = tracklets.tracklet[rows]
+    time_s = (tracklets.time_ns - frames.time_ns[0]) / 1e9
+    fit = directions_at(
+        tracklets.bounds[tracklet], tracklets.bounds[tracklet + 1], time_s[rows], 0.0, time_s, u,
+        tracklets.cov_noise, tracklets.cov_bias, half_width_s,
+    )  # fmt: skip
+    noise_rad2 = np.trace(tracklets.cov_noise, axis1=1, axis2=2)[rows] / 2
+    leverage = (np.trace(fit.cov_noise, axis1=1, axis2=2) / 2 - fit.unmodelled) / noise_rad2
+    return _AboutMotion(u[rows] - fit.u, fit.w, noise_rad2, leverage)
 
 
 def _with_trails(tracklets: TrackletSightings, frames: Frames) -> TrackletSightings:
@@ -301,30 +317,21 @@ def _with_image_trails(
     """Return the sightings with the error along their motion through the image that their scatter
     shows beyond the other errors, see `image_trails`."""
     R = matrix_from_quaternion(frames.q_sensor_from_icrs)
-    frame_s = (frames.time_ns - frames.time_ns[0]) / 1e9
-    time_s, tracklet = (tracklets.time_ns - frames.time_ns[0]) / 1e9, tracklets.tracklet
     in_image = np.einsum("nij,nj->ni", R[tracklets.frame], tracklets.u_icrs)
+    time_s = (tracklets.time_ns - frames.time_ns[0]) / 1e9
     rows = _that_move(in_image, time_s, tracklets.bounds)
     if not len(rows):
         return tracklets
-    v = np.nan_to_num(frames.v_gcrf_km_s)
-    u = aberrate(tracklets.u_icrs, -v[tracklets.frame])
-    fit = directions_at(
-        tracklets.bounds[tracklet[rows]], tracklets.bounds[tracklet[rows] + 1], time_s[rows], 0.0,
-        time_s, u, tracklets.cov_noise, tracklets.cov_bias, half_width_s,
-    )  # fmt: skip
-    noise = tracklets.cov_noise[rows]
-    variance = np.trace(noise, axis1=1, axis2=2) / 2
-    leverage = (np.trace(fit.cov_noise, axis1=1, axis2=2) / 2 - fit.unmodelled) / variance
-    frame = tracklets.frame[rows]
+    about, frame = _about_motion(tracklets, frames, rows, half_width_s), tracklets.frame[rows]
+    frame_s = (frames.time_ns - frames.time_ns[0]) / 1e9
     by_turn = np.cross(angular_rates(frame_s, R, np.ones(len(R), bool))[frame], in_image[rows])
-    moves = fit.w + np.einsum("nji,nj->ni", R[frame], by_turn)
-    time2 = trail_time2(u[rows] - fit.u, moves, noise, leverage)
+    moves = about.w + np.einsum("nji,nj->ni", R[frame], by_turn)
+    time2 = trail_time2(about.miss, moves, tracklets.cov_noise[rows], about.leverage)
     if not time2:
         return tracklets
-    with_trails = tracklets.cov_noise.copy()
-    with_trails[rows] += time2 * moves[:, :, None] * moves[:, None, :]
-    return tracklets._replace(cov_noise=with_trails)
+    noise = tracklets.cov_noise.copy()
+    noise[rows] += time2 * moves[:, :, None] * moves[:, None, :]
+    return tracklets._replace(cov_noise=noise)
 
 
 def _that_move(in_image: Array, time_s: Array, bounds: Indices) -> Indices:

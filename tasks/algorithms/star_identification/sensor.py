@@ -221,8 +221,7 @@ def _probe(
 
 def _are_stars(frames: FrameSample, skies: Skies, model: SensorModel, scale: float) -> bool:
     """Return whether all of some frames are identified at once: they are no crowd."""
-    quick = model.matching._replace(time_limit_s=model.matching.time_limit_s / 4, crowded=False)
-    tried = model._replace(scale=scale, matching=quick)
+    tried = model._replace(scale=scale, matching=_quick(model.matching))
     return bool(identify_sample(frames, skies, tried, share=FIRST_SHARE)[0].solved.all())
 
 
@@ -273,10 +272,8 @@ def _first_scale(
     tries += [(tried, True) for tried, also in zip(attempts, in_crowd, strict=True) if also]
     # Each further attempt is one more chance of a false alarm.
     threshold = matching.threshold + np.log(max(len(tries) - 1, 1))
-    quick = matching._replace(
-        time_limit_s=matching.time_limit_s / 4, threshold=threshold, crowded=False
-    )
     thorough = matching._replace(threshold=threshold)
+    quick = _quick(thorough)
     weight = np.where([is_thorough for _, is_thorough in tries], THOROUGH, 1.0)
     of_all = _probe_share(len(probe.t_s))
     for k, (tried, is_thorough) in enumerate(tries):
@@ -287,6 +284,11 @@ def _first_scale(
         if any(found):
             return _likeliest_scale(probe.centroids, found, skies, tried, scales)
     return model._replace(scale=scales[0]), [None] * len(probe.t_s)
+
+
+def _quick(matching: MatchSettings) -> MatchSettings:
+    """Return the settings of a search that is worth a try, and not for crowds."""
+    return matching._replace(time_limit_s=matching.time_limit_s / 4, crowded=False)
 
 
 def _probe_share(n_probed: int) -> float:

@@ -97,13 +97,13 @@ def time_error(motion: AlongMotion, variance_rad2: Array) -> float:
     used = motion.free > MIN_FREE
     _, rate, miss, free, weight = (values[used] for values in motion)
     stated = free * variance_rad2[used]
-    variance = stated + free * (rate * TRIED_S[:, None]) ** 2
-    cost, without = _cost(miss, variance, weight), _cost(miss, stated[None], weight)[0]
+    cost = [_cost(miss, stated + free * (rate * tried_s) ** 2, weight) for tried_s in TRIED_S]
     best = int(np.argmin(cost))
-    return float(TRIED_S[best]) if cost[best] < without - MIN_GAIN else 0.0
+    clear = cost[best] < _cost(miss, stated, weight) - MIN_GAIN
+    return float(TRIED_S[best]) if clear else 0.0
 
 
-def _cost(miss: Array, variance: Array, weight: Array) -> Array:
-    """Return -2 log-likelihood (m,) of residuals (n,) with variances (m, n)."""
+def _cost(miss: Array, variance: Array, weight: Array) -> float:
+    """Return -2 log-likelihood of residuals with these variances, (n,) each."""
     square = np.minimum(miss**2 / variance, LARGEST)
-    return (np.log(variance) + square) @ weight
+    return float((np.log(variance) + square) @ weight)
