@@ -11,6 +11,7 @@ What all directions of a sensor share is fitted with its sigma as prior. Nothing
 
 import re
 import sys
+from functools import cache
 from pathlib import Path
 from typing import NamedTuple
 
@@ -184,8 +185,7 @@ def rows_of(segment, folder):
         values[str(row.getType())].append(row)
     dates = [row.getEpoch() for row in values["ANGLE_1"]]
     angles = [[row.getMeasurement() for row in values[name]] for name in ("ANGLE_1", "ANGLE_2")]
-    states = ephemeris(folder / str(about.getEphemerisNames().get(Integer(1))))
-    places = {state.getDate(): state.getPosition().toArray() for state in states}
+    places = places_in(folder / str(about.getEphemerisNames().get(Integer(1))))
     told = re.findall(r"([\d.]+)(?=, DEC| arcsec| km)", " ".join(map(str, about.getComments())))
     sigmas = np.array(told, float) * UNITS
     name = str(about.getParticipants().get(Integer(1)))
@@ -196,12 +196,13 @@ def rows_of(segment, folder):
     )
 
 
-def ephemeris(path):
-    """Return the states of an OEM."""
+@cache  # the TDMs of all objects that a sensor sees name its OEM
+def places_in(path):
+    """Return the places of a sensor by time, from its OEM [m]."""
     message = ParserBuilder().buildOemParser().parseMessage(DataSource(File(str(path))))
     (of_one,) = message.getSatellites().values()
     (segment,) = of_one.getSegments()
-    return segment.getCoordinates()
+    return {state.getDate(): state.getPosition().toArray() for state in segment.getCoordinates()}
 
 
 def with_own_sigmas(rows, object_id, dataset):

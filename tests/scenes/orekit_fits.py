@@ -1,11 +1,8 @@
 """Orbits that Orekit fits to the exported messages of a night, against the truth of its log.
 
-python tests/scenes/orekit_fits.py LOG DATASET MESSAGES [medians]     # prints a table as JSON
+As a process: `scenes.orekit_fits LOG DATASET MESSAGES [medians]` prints the table as JSON.
 """
 
-import io
-import runpy
-import subprocess
 import sys
 from pathlib import Path
 from types import SimpleNamespace
@@ -20,15 +17,13 @@ from epipole.schemas.bridge import to_polars
 from epipole.schemas.options import Message
 from epipole.tasks.algorithms.evaluation import squared_normalised_errors
 from epipole.tasks.evaluate.matching import locate_objects, true_objects, with_truth
+from scenes.orekit_process import printed_by, started_example
 
-EXAMPLE = Path(__file__).parents[2] / "examples" / "orekit_orbits.py"
 ENOUGH_S, ENOUGH_SENSORS = 10.0, 2  # what a fit needs: less tells no velocity, or no distance
 
 
 def orekit_fits(log: Path, dataset: Path, messages: Path, medians: bool = False) -> pl.DataFrame:
     """Return a row for each object of a night: how Orekit's fit went, and its errors.
-
-    It runs in a process of its own, because Java takes over a process's signals.
 
     Parameters
     ----------
@@ -48,10 +43,8 @@ def orekit_fits(log: Path, dataset: Path, messages: Path, medians: bool = False)
         `chi2` and its degrees of `freedom`, `nees`: the squared error over the covariance, over 6,
         and `km`: the error of the position, all null without a fit.
     """
-    command = [sys.executable, __file__, str(log), str(dataset), str(messages)]
-    command += ["medians"] if medians else []
-    done = subprocess.run(command, check=True, stdout=subprocess.PIPE)
-    return pl.read_json(io.BytesIO(done.stdout), infer_schema_length=None)
+    asked = ["medians"] if medians else []
+    return printed_by("orekit_fits", log, dataset, messages, *asked)
 
 
 def main(log: Path, dataset: Path, messages: Path, *medians: Path) -> None:
@@ -59,8 +52,7 @@ def main(log: Path, dataset: Path, messages: Path, *medians: Path) -> None:
     (night,) = (path.name.removeprefix("night=") for path in dataset.glob("night=*"))
     if not messages.exists():
         export(Message.tdm, str(dataset), night, messages)
-    example = SimpleNamespace(**runpy.run_path(str(EXAMPLE)))
-    example.give_data()
+    example = started_example()
     truth, shown = read_truth(log), objects_shown(log, dataset)
     rows = []
     for path in sorted(messages.glob("*.tdm")):

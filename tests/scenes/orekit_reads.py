@@ -1,13 +1,8 @@
 """What Orekit reads in exported messages of orbits: states and covariances.
 
-python tests/scenes/orekit_reads.py FOLDER...     # prints a table as JSON
-
-It runs in a process of its own, because Java takes over a process's signals.
+As a process: `scenes.orekit_reads FOLDER...` prints the table as JSON.
 """
 
-import io
-import runpy
-import subprocess
 import sys
 from collections.abc import Iterator
 from pathlib import Path
@@ -16,8 +11,10 @@ from typing import Any
 
 import polars as pl
 
-EXAMPLE = Path(__file__).parents[2] / "examples" / "orekit_orbits.py"
-STATE = ("x_km", "y_km", "z_km", "vx_km_s", "vy_km_s", "vz_km_s")
+from epipole.schemas.columns import POSITION, VELOCITY
+from scenes.orekit_process import printed_by, started_example
+
+STATE = (*POSITION, *VELOCITY)
 
 
 def orekit_reads(*folders: Path) -> pl.DataFrame:
@@ -30,15 +27,12 @@ def orekit_reads(*folders: Path) -> pl.DataFrame:
         [km, km/s], `gcrf_x_km` to `gcrf_z_km`: its place in GCRF by Orekit's rotation of the Earth,
         `cov`: the covariance's lower triangle, row by row [km, s].
     """
-    command = [sys.executable, __file__, *map(str, folders)]
-    done = subprocess.run(command, check=True, stdout=subprocess.PIPE)
-    return pl.read_json(io.BytesIO(done.stdout), infer_schema_length=None)
+    return printed_by("orekit_reads", *folders)
 
 
 def main(*folders: Path) -> None:
     """Print the table of `orekit_reads`."""
-    example = SimpleNamespace(**runpy.run_path(str(EXAMPLE)))
-    example.give_data()
+    example = started_example()
     rows = [
         {"folder": folder.name, "file": path.name} | row_of(example, *read)
         for folder in folders
@@ -55,13 +49,11 @@ def parsers(example: SimpleNamespace) -> Any:
 
 def of_oem(example: SimpleNamespace, source: Any) -> Iterator[tuple[Any, Any, Any]]:
     """Yield state, frame and covariance of an OEM."""
-    for satellite in (
-        parsers(example).buildOemParser().parseMessage(source).getSatellites().values()
-    ):
-        for segment in satellite.getSegments():
-            matrices = [each.getCovarianceMatrix() for each in segment.getCovarianceMatrices()]
-            for state, matrix in zip(segment.getCoordinates(), matrices, strict=True):
-                yield state, segment.getFrame(), matrix
+    (satellite,) = parsers(example).buildOemParser().parseMessage(source).getSatellites().values()
+    (segment,) = satellite.getSegments()
+    matrices = [each.getCovarianceMatrix() for each in segment.getCovarianceMatrices()]
+    for state, matrix in zip(segment.getCoordinates(), matrices, strict=True):
+        yield state, segment.getFrame(), matrix
 
 
 def of_opm(example: SimpleNamespace, source: Any) -> Iterator[tuple[Any, Any, Any]]:
