@@ -2,7 +2,8 @@
 
 The unknowns are the state at an epoch, two areas over mass with priors, and for each sensor the
 errors that all its directions share: of the attitude and of the position, with their stated sigmas
-as priors. The fit begins with the directions near the initial state and takes in the others by and
+as priors. A wide prior of the velocity keeps an orbit closed that the directions leave open, as
+those of one satellite over a minute do. The fit begins with the directions near the initial state and takes in the others by and
 by, so that it converges over many revolutions.
 """
 
@@ -11,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from epipole.tasks.algorithms.constants import SPEED_OF_LIGHT_KM_S
+from epipole.tasks.algorithms.constants import GM_KM3_S2, SPEED_OF_LIGHT_KM_S
 from epipole.tasks.algorithms.kernels import kernel
 from epipole.tasks.algorithms.orbits.forces import N_UNKNOWNS, Surroundings
 from epipole.tasks.algorithms.orbits.shared_errors import ArcEquations, no_equations
@@ -38,6 +39,10 @@ MAX_OUTLIERS = 0.05
 REFITS = 6
 BACK_S = 2.0  # light time of the farthest objects
 MIN_DIRECTIONS = 4
+# 1-sigma of the radial and of the horizontal velocity about that of a circular orbit, over its
+# speed: what all objects around the Earth have, eccentric ones too. At perigee, an eccentricity of
+# 0.7 is 1.0 sigma from it. A velocity that the directions show to a per cent moves by 0.001 sigma.
+VELOCITY_SIGMA = 0.3
 
 
 class ObjectDirections(NamedTuple):
@@ -229,7 +234,9 @@ def _at(
     path = integrate(unknowns, epoch_s, first, last, around)
     _sum_up(path, directions, used, shared, sums, of_directions)
     off = (unknowns[6:] - areas.mean) / np.where(areas.sigma > 0.0, areas.sigma, 1.0)
-    of_priors = float(off @ off) + float(np.einsum("si,sij,sj->", shared, directions.prior, shared))
+    pulls, _ = _velocity_prior(unknowns[:6])
+    of_priors = float(off @ off) + float(pulls @ pulls)
+    of_priors += float(np.einsum("si,sij,sj->", shared, directions.prior, shared))
     chi2 = float(of_directions[used].sum()) + of_priors
     return _Point(unknowns, shared, sums, chi2 if np.isfinite(chi2) else np.inf, of_directions)
 
@@ -240,7 +247,7 @@ def _step(
     """Return the steps of the unknowns and of the shared errors, the covariance, and the decrease
     of chi-square that they promise."""
     sums, free = point.sums, np.concatenate([np.ones(6, bool), areas.sigma > 0.0])
-    information, right = _with_areas(point, areas)
+    information, right = _with_priors(point, areas)
     pulled = sums.of_sensors - np.einsum("sij,sj->si", directions.prior, point.shared)
     blocks = sums.blocks + directions.prior
     unit = 1.0 / np.sqrt(np.diagonal(blocks, axis1=1, axis2=2))
@@ -248,7 +255,7 @@ def _step(
     scaled = blocks * unit[:, :, None] * unit[:, None, :]
     absorbed = unit[:, :, None] * np.linalg.solve(scaled, both)
     back = np.einsum("ski,skj->ij", sums.coupling, absorbed)
-    matrix = (sums.orbit + np.diag(information) - back[:, :N_UNKNOWNS])[np.ix_(free, free)]
+    matrix = (sums.orbit + information - back[:, :N_UNKNOWNS])[np.ix_(free, free)]
     scale = 1.0 / np.sqrt(np.diag(matrix))
     if not np.isfinite(scale).all():
         raise np.linalg.LinAlgError
@@ -260,13 +267,38 @@ def _step(
     return step, turned, cov, float(step @ right + np.sum(turned * pulled))
 
 
-def _with_areas(point: _Point, areas: AreaPrior) -> tuple[Array, Array]:
-    """Return the information of the areas' priors, (8,), and the right side with them."""
-    information = np.zeros(N_UNKNOWNS)
-    information[6:] = 1.0 / np.where(areas.sigma > 0.0, areas.sigma, 1.0) ** 2
+def _with_priors(point: _Point, areas: AreaPrior) -> tuple[Array, Array]:
+    """Return the information of the orbit's priors, (8, 8), and the right side with them."""
+    of_areas = 1.0 / np.where(areas.sigma > 0.0, areas.sigma, 1.0) ** 2
+    information = np.diag(np.append(np.zeros(6), of_areas))
     right = point.sums.of_orbit.copy()
-    right[6:] -= information[6:] * (point.unknowns[6:] - areas.mean)
+    right[6:] -= of_areas * (point.unknowns[6:] - areas.mean)
+    pulls, slopes = _velocity_prior(point.unknowns[:6])
+    information[:6, :6] = slopes.T @ slopes
+    right[:6] -= slopes.T @ pulls
     return information, right
+
+
+def _velocity_prior(state: Array) -> tuple[Array, Array]:
+    """Return how far a velocity is from a circular orbit's, (2,), with the derivatives, (2, 6).
+
+    Radially and horizontally, over `VELOCITY_SIGMA` of the circular orbit's speed.
+    """
+    r_km, v_km_s = state[:3], state[3:]
+    distance = float(np.linalg.norm(r_km))
+    up = r_km / distance
+    radial = float(up @ v_km_s)
+    across = v_km_s - radial * up
+    level = float(np.linalg.norm(across))
+    sigma = VELOCITY_SIGMA * np.sqrt(GM_KM3_S2 / distance)
+    velocity = np.array([radial, level]) / sigma
+    slopes = np.empty((2, 6))
+    # The sigma falls with the root of the distance.
+    slopes[:, :3] = velocity[:, None] * up / (2 * distance)
+    slopes[0, :3] += across / (distance * sigma)
+    slopes[1, :3] -= radial / level * across / (distance * sigma)
+    slopes[0, 3:], slopes[1, 3:] = up / sigma, across / (level * sigma)
+    return velocity - np.array([0.0, 1.0 / VELOCITY_SIGMA]), slopes
 
 
 def _converge(
@@ -405,10 +437,10 @@ def _without_outliers(
 
 
 def _equations(point: _Point, areas: AreaPrior) -> ArcEquations:
-    """Return the equations at a point, with the priors of the areas; errors count from zero."""
+    """Return the equations at a point, with the priors of the orbit; errors count from zero."""
     sums, free = point.sums, np.flatnonzero(np.append(np.ones(6), areas.sigma) > 0.0)
-    information, right = _with_areas(point, areas)
-    orbit = sums.orbit + np.diag(information)
+    information, right = _with_priors(point, areas)
+    orbit = sums.orbit + information
     right = right + np.einsum("ski,sk->i", sums.coupling, point.shared)
     of_sensors = sums.of_sensors + np.einsum("sij,sj->si", sums.blocks, point.shared)
     return ArcEquations(

@@ -12,6 +12,7 @@ from epipole.tasks.algorithms.orbits.orbit_determination import (
     determine_orbit,
     log_evidence,
 )
+from epipole.tasks.algorithms.orbits.orbital_elements import elements_of
 from epipole.tasks.algorithms.orbits.trajectories import propagate_unknowns
 
 METRE, MM_S = 1e-3, 1e-6
@@ -89,6 +90,36 @@ def test_two_passages_before_one_sensor_converge_though_their_distance_is_hardly
     orbit = fit(directions, LOW, FIXED, seed)
     off = orbit.unknowns[:6] - LOW[:6]
     assert off @ np.linalg.solve(orbit.cov[:6, :6], off) < 22.5  # 1 in 1,000 is above
+
+
+FEW = np.concatenate([c + np.linspace(-8.0, 8.0, 8) for c in (-22.0, 22.0)])
+
+
+def few(seed):
+    """Return the orbit of two short passages before one sensor, and how far it is off."""
+    directions = trial(seed, LOW, n_sensors=1, times_s=FEW, noise=30.0, bias=0.0)
+    orbit = fit(directions, LOW, FIXED, seed)
+    off = orbit.unknowns[:6] - LOW[:6]
+    return elements_of(orbit.unknowns[:6]), off @ np.linalg.solve(orbit.cov[:6, :6], off)
+
+
+def test_an_orbit_that_the_directions_leave_open_is_closed(monkeypatch):
+    elements, square = zip(*map(few, range(20)), strict=True)
+    assert (np.array(elements)[:, 0] > 0.0).all()
+    assert (np.array(elements)[:, 1] < 1.0).all()
+    assert np.mean(square) < 6 * 1.3
+    assert max(square) < 30.0
+    monkeypatch.setattr(determination, "VELOCITY_SIGMA", 1e6)
+    without = np.array([few(seed)[0] for seed in range(20)])
+    assert (~(without[:, 1] < 1.0)).sum() > 5
+
+
+def test_the_derivatives_of_the_prior_are_right():
+    state, size = LOW[:6] * [1.0, 1.1, 0.9, 1.2, 0.8, 1.0], np.array([0.1] * 3 + [1e-4] * 3)
+    _, slopes = determination._velocity_prior(state)
+    for k, h in enumerate(np.diag(size)):
+        after, before = (determination._velocity_prior(state + sign * h)[0] for sign in (1, -1))
+        np.testing.assert_allclose(slopes[:, k], (after - before) / (2 * size[k]), rtol=1e-6)
 
 
 def test_the_derivatives_are_those_of_the_residuals():
