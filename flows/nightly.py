@@ -13,7 +13,14 @@ from prefect import flow
 from epipole.flows.night.calibrating import calibrate, find_cameras
 from epipole.flows.night.doubt import settle
 from epipole.flows.night.log_checks import check_logs, check_readings, wrong_velocities
-from epipole.flows.night.log_choice import LastNights, Night, find_logs, night_asked, run_name
+from epipole.flows.night.log_choice import (
+    LastNights,
+    Night,
+    find_logs,
+    night_asked,
+    nights_asked_before,
+    run_name,
+)
 from epipole.flows.night.recorded_nights import (
     EarlierNights,
     gave_something,
@@ -58,7 +65,7 @@ from epipole.io.work.folder import work_folder, work_root
 from epipole.io.work.recipe import Recipe, recipe_of
 from epipole.io.work.work_layout import ReadFolder, SolvedParts, WorkFolder
 from epipole.schemas.bridge import concat
-from epipole.schemas.dates import LAST_NIGHTS, YESTERDAY, nights_before
+from epipole.schemas.dates import LAST_NIGHTS, YESTERDAY
 from epipole.schemas.errors import EpipoleError, LogError, NoFramesError
 from epipole.schemas.rejects import Reason
 from epipole.schemas.run_record import RunState
@@ -97,7 +104,8 @@ def nightly(
         out: The dataset, a folder or URL; it is created if missing.
         settings: Groups of settings, as in a settings file; missing ones keep their defaults.
         night: Publish only this UTC date: YYYY-MM-DD, or yesterday (the day before the run was
-            scheduled). None: every night that the logs have frames of.
+            scheduled); or the dates of a range, in order: 2019-04-01/2019-04-30. None: every night
+            that the logs have frames of.
         replace: Replace a night even if one of its earlier logs is not given.
         known: A file of element sets, to name known objects by: two-line elements, or OMM in CSV,
             JSON or XML. A path or URL. None: no object gets a name.
@@ -118,11 +126,14 @@ def nightly(
     check_star_catalogue(settings.identification.catalogue)
     catalogue = read_known_objects(known) if known else None
     order = Order(logs, out, settings, catalogue, replace, again, {})
-    before = waiting_nights()
-    if night == YESTERDAY and asked is not None:
-        before |= set(nights_before(asked, last_nights - 1))
-    dates = sorted(date for date in before if asked and date < asked)
-    earlier = tuple(filter(None, (made_before(order, date) for date in dates)))
+    before = nights_asked_before(night, asked, last_nights)
+    waiting = (date for date in waiting_nights() if asked and date < asked)
+    remade = set(before) if again and night != YESTERDAY else set()
+    earlier = tuple(
+        sentence
+        for date in sorted({*before, *waiting})
+        if (sentence := made_before(order._replace(again=date in remade), date))
+    )
     try:
         summary = recorded(order, asked)
     except NoFramesError as error:
@@ -148,7 +159,7 @@ def made_before(order: Order, night: str) -> str | None:
     What is wrong with it does not stop the night that is asked for.
     """
     try:
-        summary = recorded(order._replace(again=False), night, asked=False)
+        summary = recorded(order, night, asked=False)
     except NoFramesError:
         return None
     except EpipoleError as error:

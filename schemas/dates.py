@@ -23,6 +23,12 @@ def is_night(text: object) -> bool:
         return False
 
 
+def nights_from(first: str, last: str) -> list[str]:
+    """Return the nights from the first to the last, in order; none if the last is before it."""
+    begin, end = datetime.date.fromisoformat(first), datetime.date.fromisoformat(last)
+    return [(begin + datetime.timedelta(days=k)).isoformat() for k in range((end - begin).days + 1)]
+
+
 def nights_before(night: str, count: int) -> list[str]:
     """Return the last nights before a night, in order."""
     day = datetime.date.fromisoformat(night)

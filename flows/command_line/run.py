@@ -19,7 +19,7 @@ from epipole.flows.command_line.options import (
     print_lines,
 )
 from epipole.flows.prefect.server_process import Launched, launch
-from epipole.schemas.dates import LAST_NIGHTS, YESTERDAY, nights_before
+from epipole.schemas.dates import LAST_NIGHTS, YESTERDAY, nights_before, nights_from
 from epipole.schemas.options import Runner
 
 if TYPE_CHECKING:  # imported when the command runs
@@ -150,11 +150,10 @@ def _dates(night: str | None, to: str | None, last_nights: int) -> Sequence[str 
     check_night(to, "--to")
     if night is None:
         raise typer.BadParameter("give the first night by --night", param_hint="--to")
-    first, last = datetime.date.fromisoformat(night), datetime.date.fromisoformat(to)
-    if last < first:
+    nights = nights_from(night, to)
+    if not nights:
         raise typer.BadParameter(f"{to} is before {night}", param_hint="--to")
-    days = range((last - first).days + 1)
-    return [(first + datetime.timedelta(days=day)).isoformat() for day in days]
+    return nights
 
 
 def _print_one(ended: "Ended", quiet: bool, as_json: bool) -> None:

@@ -11,7 +11,7 @@ from pydantic import Field
 
 from epipole.io.logs.listing import list_logs
 from epipole.io.logs.logged_times import read_log_times
-from epipole.schemas.dates import YESTERDAY, nights_before
+from epipole.schemas.dates import YESTERDAY, nights_before, nights_from
 from epipole.schemas.errors import EpipoleError, LogError, NoFramesError
 from epipole.schemas.rejects import Reason, reject_rows
 from epipole.schemas.spans import DAY_NS, SPAN_NS
@@ -174,23 +174,24 @@ def _date(time_ns: int) -> str:
     )
 
 
-# The night that a run is asked for; Prefect checks it before it creates a run.
+# The nights that a run is asked for; Prefect checks them before it creates a run.
 
 LONGEST_NAME = 60  # of a log in a run's name
 
-Night = Annotated[str | None, Field(pattern=rf"^(\d{{4}}-\d\d-\d\d|{YESTERDAY})$")]
+_DATE = r"\d{4}-\d\d-\d\d"
+Night = Annotated[str | None, Field(pattern=f"^({_DATE}(/{_DATE})?|{YESTERDAY})$")]
 LastNights = Annotated[int, Field(ge=1, le=366)]
 
 
 def night_asked(night: str | None) -> str | None:
-    """Return the UTC date that is asked for; None: every night.
+    """Return the UTC date that is asked for, the last one of a range; None: every night.
 
     Yesterday is the day before the run was scheduled, even if the run starts late.
 
     Raises
     ------
     EpipoleError
-        If there is no such date.
+        If there is no such date, or a range ends before it begins.
     """
     if night is None:
         return None
@@ -200,9 +201,28 @@ def night_asked(night: str | None) -> str | None:
         due: datetime.datetime = flow_run.scheduled_start_time
         return nights_before(due.astimezone(datetime.UTC).date().isoformat(), 1)[0]
     try:
-        return datetime.date.fromisoformat(night).isoformat()
+        first, last = _range(night)
+        nights = nights_from(first, last)
     except ValueError as error:
         raise EpipoleError(f"night {night}: no such date; give one such as 2019-04-01") from error
+    if not nights:
+        raise EpipoleError(f"night {night}: {last} is before {first}; give the first night first")
+    return nights[-1]
+
+
+def nights_asked_before(night: str | None, asked: str | None, last_nights: int) -> list[str]:
+    """Return the nights that are asked for before the one of `night_asked`, in order."""
+    if night is None or asked is None:
+        return []
+    if night == YESTERDAY:
+        return nights_before(asked, last_nights - 1)
+    return nights_from(_range(night)[0], asked)[:-1]
+
+
+def _range(night: str) -> tuple[str, str]:
+    """Return the first and the last night of a range, as in ``2019-04-01/2019-04-30``."""
+    first, _, last = night.partition("/")
+    return first, last or first
 
 
 def run_name() -> str:
@@ -210,10 +230,7 @@ def run_name() -> str:
     from prefect.runtime import flow_run  # not above, as in `night_asked`
 
     asked: dict[str, Any] = flow_run.parameters
-    try:
-        night = night_asked(asked.get("night"))
-    except EpipoleError:  # the run itself reports it
-        night = asked["night"]
+    night = night_asked(YESTERDAY) if asked.get("night") == YESTERDAY else asked.get("night")
     return f"night {night}" if night else f"all nights of {_what(asked.get('logs'))}"
 
 

@@ -15,7 +15,7 @@ from prefect.client.schemas.filters import FlowRunFilter
 from prefect.exceptions import PrefectException
 from prefect.runtime import deployment, flow_run
 
-from epipole.schemas.dates import YESTERDAY, is_night, nights_before
+from epipole.schemas.dates import YESTERDAY, is_night, nights_before, nights_from
 
 LOGGER = logging.getLogger(__name__)
 
@@ -42,21 +42,22 @@ def waiting_nights() -> set[str]:
     except (httpx.HTTPError, PrefectException) as error:
         LOGGER.warning("which nights wait is not known: %s", " ".join(str(error).split()))
         return set()
-    nights = {
-        _night(run.parameters.get("night"), run.expected_start_time)
+    return {
+        night
         for run in runs
         if _but_night(run.parameters) == _but_night(mine)
+        for night in _nights(run.parameters.get("night"), run.expected_start_time)
     }
-    return {night for night in nights if night is not None}
 
 
 def _but_night(parameters: dict[str, Any]) -> dict[str, Any]:
     return {name: value for name, value in parameters.items() if name != "night"}
 
 
-def _night(asked: object, due: datetime.datetime | None) -> str | None:
-    """Return the night that a run asks for; None: not a single one."""
+def _nights(asked: object, due: datetime.datetime | None) -> list[str]:
+    """Return the nights that a run asks for; none if it asks for all that its logs have."""
     if asked == YESTERDAY and due is not None:
-        (night,) = nights_before(due.astimezone(datetime.UTC).date().isoformat(), 1)
-        return night
-    return asked if isinstance(asked, str) and is_night(asked) else None
+        return nights_before(due.astimezone(datetime.UTC).date().isoformat(), 1)
+    first, _, last = asked.partition("/") if isinstance(asked, str) else ("", "", "")
+    ends = first, last or first
+    return nights_from(*ends) if all(is_night(end) for end in ends) else []

@@ -18,6 +18,9 @@ pytestmark = pytest.mark.long
 
 ROOT = Path(__file__).parents[2]
 NIGHT = "2019-04-01"
+CAMERA = dict.fromkeys(["k1", "k2", "p1", "p2", "k3"], 0.0) | {
+    "width": 512, "height": 512, "fx_px": 1e3, "fy_px": 1e3, "cx_px": 255.5, "cy_px": 255.5
+}  # fmt: skip
 
 
 class Deployed:
@@ -59,7 +62,9 @@ def deployed(tmp_path_factory, night_log) -> Iterator[Deployed]:
     (folder / "logs").mkdir()
     (folder / "logs" / night_log.name).symlink_to(night_log)
     with LogWriter(folder / "logs" / "another.mcap") as log:  # of another night
-        log.frame("a", 1_554_000_000 * 10**9, frame_number=0, exposure_s=0.1, x_px=[], y_px=[])
+        time_ns = 1_554_000_000 * 10**9
+        log.camera("a", time_ns, CAMERA)
+        log.frame("a", time_ns, frame_number=0, exposure_s=0.1, x_px=[], y_px=[])
     settings = deploy_files(folder, folder / "logs", folder / "dataset")
     deployment = yaml.safe_load((folder / "prefect.yaml").read_text())["deployments"][0]
     assert deployment["work_pool"]["name"] == POOL
@@ -231,3 +236,15 @@ def test_a_run_from_the_command_line_goes_to_the_server_of_the_users_profile(
     (run,) = deployed.prefect.find("flow_runs", flow_runs=named)
     assert run["state_type"] == "COMPLETED"
     assert not list(tmp_path.glob("*.db*"))  # no embedded server's database
+
+
+def test_a_range_of_nights_is_made_by_the_deployment_without_a_schedule(deployed):
+    asked = f"2019-03-31/{NIGHT}"
+    ran = deployed.prefect.command(
+        "deployment", "run", "nightly/backfill", "--param", f"night={asked}", "--watch"
+    )
+    assert ran.returncode == 0, ran.stdout + ran.stderr
+    nights = {path.name for path in deployed.out.glob("night=*")}
+    assert nights == {"night=2019-03-31", f"night={NIGHT}"}
+    (run,) = deployed.prefect.find("flow_runs", flow_runs={"name": {"any_": [f"night {asked}"]}})
+    assert "2019-03-31 made: " in run["state"]["message"]

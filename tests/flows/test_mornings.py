@@ -111,6 +111,34 @@ def test_late_logs_make_their_nights_again_in_order(tmp_path, monkeypatch, no_ea
     assert ended.stdout.splitlines()[-1] == "2 without frames"
 
 
+def test_a_range_of_nights_is_made_in_order_and_again_if_asked(tmp_path):
+    folder, out = tmp_path / "logs", tmp_path / "out"
+    folder.mkdir()
+    days = [f"2019-04-{day:02}" for day in (28, 29, 30)]
+    for day in (days[0], days[2]):
+        write_log(folder / f"{day}.mcap", day)
+    asked = {
+        "logs": str(folder),
+        "out": str(out),
+        "settings": PLAIN,
+        "night": "2019-04-28/2019-04-30",
+    }
+    summary = nightly(**asked)
+    assert (summary.nights, summary.unchanged) == ([days[2]], False)
+    assert [sentence[:16] for sentence in summary.earlier] == [f"{days[0]} made:"]
+    assert (same := nightly(**asked)).unchanged
+    assert same.earlier == ()
+    anew = nightly(**asked, again=True)
+    assert not anew.unchanged
+    assert [sentence[:16] for sentence in anew.earlier] == [f"{days[0]} made:"]
+
+    (folder / f"{days[0]}.mcap").unlink()  # a night that fails stops no other
+    write_log(folder / "other.mcap", days[0], 3)
+    failed = nightly(**asked)
+    assert failed.unchanged
+    assert failed.earlier[0].startswith(f"{days[0]} failed: ")
+
+
 def test_what_is_wrong_with_a_night_before_does_not_stop_the_one_asked_for(tmp_path, monkeypatch):
     folder, out = tmp_path / "logs", tmp_path / "out"
     folder.mkdir()

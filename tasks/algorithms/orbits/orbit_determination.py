@@ -3,8 +3,8 @@
 The unknowns are the state at an epoch, two areas over mass with priors, and for each sensor the
 errors that all its directions share: of the attitude and of the position, with their stated sigmas
 as priors. A wide prior of the velocity keeps an orbit closed that the directions leave open, as
-those of one satellite over a minute do. The fit begins with the directions near the initial state and takes in the others by and
-by, so that it converges over many revolutions.
+those of one satellite over a minute do. The fit begins with the directions near the initial state
+and takes in the others by and by, so that it converges over many revolutions.
 """
 
 from typing import NamedTuple

@@ -41,6 +41,14 @@ def test_the_deployment_at_the_top_of_the_repository_is_the_same(written):
     assert (ROOT / "prefect.yaml").read_text() == (written / "prefect.yaml").read_text()
 
 
+def test_there_is_a_deployment_for_earlier_nights_without_a_schedule(written):
+    nightly, backfill = yaml.safe_load((written / "prefect.yaml").read_text())["deployments"]
+    assert (nightly.pop("name"), backfill.pop("name")) == ("nightly", "backfill")
+    assert nightly.pop("description") != backfill.pop("description")
+    assert nightly.pop("schedules")
+    assert nightly == backfill
+
+
 def test_prefect_understands_the_automations(written):
     held = yaml.safe_load((written / "automations.yaml").read_text())["automations"]
     made = [AutomationCore.model_validate(automation) for automation in held]

@@ -13,7 +13,7 @@ from prefect.utilities.callables import parameter_schema
 from prefect.utilities.schema_tools.validation import ValidationError, validate
 
 from epipole.flows.night import log_choice
-from epipole.flows.night.log_choice import find_logs, night_asked, run_name
+from epipole.flows.night.log_choice import find_logs, night_asked, nights_asked_before, run_name
 from epipole.flows.nightly import nightly
 from epipole.io.logs.writer import LogWriter
 from epipole.schemas.errors import EpipoleError, LogError
@@ -180,6 +180,7 @@ def test_a_folder_without_any_log_is_an_error(tmp_path):
 
 WRONG = [
     ({"night": "tonight"}, "field 'night'.*'tonight' does not match"),
+    ({"night": "2019-04-01/"}, "field 'night'.*'2019-04-01/' does not match"),
     ({"night": "2019-4-1"}, "field 'night'.*'2019-4-1' does not match"),
     ({"settings": {"sensors": {"state_gap": 1}}}, r"'settings\.sensors'.*'state_gap' was unexp"),
     ({"settings": {"sensors": {"state_gap_s": -1}}}, r"'settings\.sensors\.state_gap_s'.*-1 is"),
@@ -238,6 +239,20 @@ class DueAt:
     def __init__(self, scheduled_start_time, parameters):
         self.scheduled_start_time = scheduled_start_time
         self.parameters = parameters
+
+
+def test_a_range_of_nights():
+    asked = "2019-03-30/2019-04-02"
+    assert night_asked(asked) == "2019-04-02"
+    before = ["2019-03-30", "2019-03-31", "2019-04-01"]
+    assert nights_asked_before(asked, "2019-04-02", 9) == before
+    assert nights_asked_before("yesterday", "2019-04-02", 4) == before
+    assert nights_asked_before("2019-04-02", "2019-04-02", 4) == []
+    assert nights_asked_before(None, None, 4) == []
+    with patch.object(prefect.runtime, "flow_run", DueAt(None, {"night": asked})):
+        assert run_name() == f"night {asked}"
+    with pytest.raises(EpipoleError, match="2019-03-30 is before 2019-04-02; give the first"):
+        night_asked("2019-04-02/2019-03-30")
 
 
 def test_a_day_that_no_month_has_is_an_error_of_the_run():

@@ -49,10 +49,13 @@ def deployed(monkeypatch):
 def test_the_nights_of_runs_that_ask_for_the_same(deployed):
     others = [
         MINE | {"night": "2019-04-04"}, MINE | {"night": "yesterday"}, MINE | {"night": None},
-        MINE | {"night": "../x"}, MINE | {"night": "2019-04-01", "out": "/other"},
+        MINE | {"night": "../x"}, MINE | {"night": "2019-04-05/2019-04-06"},
+        MINE | {"night": "2019-04-01", "out": "/other"},
     ]  # fmt: skip
     deployed(Client(MINE, *others))
-    assert waiting_nights() == {"2019-04-04", "2019-04-02"}
+    assert waiting_nights() == {
+        "2019-04-02", "2019-04-04", "2019-04-05", "2019-04-06"
+    }  # fmt: skip
 
 
 def test_none_without_a_deployment_or_an_answer(deployed, caplog):
