@@ -75,7 +75,7 @@ def read_epipolar_views(
     None: no epoch has an object that two sensors with calibrations saw.
     """
     cameras = _cameras(calibrations, sizes_px)
-    epoch_ns = _best_epoch(night)
+    epoch_ns = best_epoch(night)
     if epoch_ns is None:
         return None
     columns = ["epoch", "object_id", "sensor_id", "frame_number", "x_px", "y_px", "epipolar_px",
@@ -106,7 +106,7 @@ def _cameras(calibrations: pl.DataFrame, sizes_px: dict[str, Array]) -> dict[str
     return found
 
 
-def _best_epoch(night: NightReader) -> int | None:
+def best_epoch(night: NightReader) -> int | None:
     """Return the epoch with the most used views; the first of several."""
     best: tuple[int, int] | None = None
     carried = pl.DataFrame(schema={"epoch": pl.Int64, "views": pl.UInt32})

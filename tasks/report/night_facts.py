@@ -17,6 +17,7 @@ from epipole.schemas.rejects import NameStatus, ObjectVerdict, Reason, Trait
 from epipole.schemas.stages import Stage
 from epipole.tasks.report.epipolar_views import OPTICS, EpipolarViews, read_epipolar_views
 from epipole.tasks.report.frame_series import FrameSeries, Gap, read_frame_series
+from epipole.tasks.report.globe import Globe, read_globe
 from epipole.tasks.report.object_details import MAX_DETAILED, ObjectDetail, read_object_details
 from epipole.tasks.report.objects import (
     NightNumbers,
@@ -99,6 +100,7 @@ class NightFacts(NamedTuple):
     star_catalogue: str
     star_map: StarMap | None
     tracks: SkyTracks | None
+    globe: Globe | None
     epipolar: EpipolarViews | None
     concerned: dict[str, StarMap]
     details: list[ObjectDetail]
@@ -157,6 +159,7 @@ def read_night_facts(
         star_catalogue=night.metadata("stars", "catalogue"),
         star_map=None if series is None else read_star_map(night, series),
         tracks=read_sky_tracks(night),
+        globe=read_globe(night),
         epipolar=views,
         concerned=_concerned(night, series, residuals),
         details=read_object_details(night, [each.object_id for each in look_first(objects)]),

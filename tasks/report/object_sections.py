@@ -1,10 +1,11 @@
-"""Sections about what was found: tracklets, epipolar lines, objects, the last nights."""
+"""Sections about what was found: tracklets, the globe, epipolar lines, objects, the last nights."""
 
 from collections.abc import Mapping, Sequence
 from functools import partial
 
 from epipole.schemas.rejects import NameStatus, ObjectVerdict, Outcome
 from epipole.tasks.report.canvas import as_svg
+from epipole.tasks.report.draw_globe import draw_globe
 from epipole.tasks.report.draw_sensors import IMAGE_IN, draw_epipolar
 from epipole.tasks.report.draw_sky import draw_elements, draw_ring, draw_sky, draw_trend
 from epipole.tasks.report.frame_series import clock
@@ -45,6 +46,33 @@ def sky(facts: NightFacts) -> Section:
     heading = ("outcome", "tracklets", "meaning")
     body = beside(figures([picture]), table("What became of the tracklets", heading, rows))
     return Section("sky", title, body)
+
+
+def globe(facts: NightFacts) -> Section:
+    """Return the section with the globe: sensors, objects and lines of sight at one time."""
+    title, found = "Sensors and objects in space", facts.globe
+    if found is None:
+        return Section("globe", title, nothing("The log says of no sensor where it was."))
+    about = {each.object_id: each.about for each in facts.objects}
+    to_objects = sum(bool(sight.object_id) for sight in found.sights)
+    picture = figure(
+        draw_globe(found, about, facts.anchors),
+        f"{len(found.sensors)} sensors, {len(found.objects)} objects and {len(found.sights)} lines "
+        "of sight around the Earth.",
+        f"At {clock(found.time_ns)} UTC, in the axes of GCRF, the north pole above: sensors "
+        "(triangles), objects (dots), and who saw what. Drag to turn it.",
+    )
+    rows = [
+        ("sensors", f"{found.n_sensors:,}", f"{len(found.sensors):,}"),
+        ("objects", f"{found.n_objects:,}", f"{len(found.objects):,}"),
+        ("lines of sight", f"{found.n_sights:,}", f"{len(found.sights):,}"),
+        ("of these to objects", "", f"{to_objects:,}"),
+    ]
+    says = (
+        "A grey, dashed line is of a tracklet that belongs to no object: its length says nothing."
+    )
+    counts = table("At this time", ("what", "there are", "drawn"), rows)
+    return Section("globe", title, beside(figures([picture]), counts + paragraph(says)))
 
 
 def epipolar(facts: NightFacts) -> Section:

@@ -295,6 +295,113 @@ class Picture {
     make("text", { x: atX, y: atY, style: `${style}; text-anchor: ${anchor}` }, this.own, says);
   }
 }
+
+const EARTH = 6.378137; // 1,000 km
+
+// A globe that turns. Its lines and dots have places in space, in units of 1,000 km.
+class Globe extends Picture {
+  constructor(svg) {
+    super(svg);
+    this.first = numbers(svg.dataset.turn);
+    this.turn = [...this.first];
+    this.addButtons();
+  }
+
+  prepare() {
+    if (this.dots) return;
+    super.prepare();
+    const read = element => {
+      const all = numbers(element.dataset.p);
+      return Array.from({ length: all.length / 3 }, (_, k) => all.slice(3 * k, 3 * k + 3));
+    };
+    this.points = this.dots.map(dot => read(dot)[0]);
+    this.paths = [...this.svg.querySelectorAll("path[data-p]")].map(path => [path, read(path)]);
+    this.earth = this.svg.querySelector(".earth");
+    this.draw();
+  }
+
+  shown(place) { return place; }
+
+  inside([x, y]) { return x >= 0 && y >= 0 && x <= this.view.width && y <= this.view.height; }
+
+  press(event) {
+    super.press(event);
+    this.svg.setPointerCapture(event.pointerId);
+  }
+
+  drag(event, at) {
+    const before = this.pressed.get(event.pointerId);
+    const others = [...this.pressed].filter(([id]) => id !== event.pointerId);
+    if (others.length) {
+      const apart = point => Math.hypot(point[0] - others[0][1][0], point[1] - others[0][1][1]);
+      this.zoom(apart(at) / Math.max(apart(before), 1));
+    } else {
+      const angle = 90 / this.view.width / Math.sqrt(this.scale);
+      this.turned(angle * (before[0] - at[0]), angle * (at[1] - before[1]));
+    }
+    this.pressed.set(event.pointerId, at);
+  }
+
+  turned(east, north) {
+    this.turn = [this.turn[0] + east, Math.max(-90, Math.min(90, this.turn[1] + north))];
+    this.draw();
+  }
+
+  wheel(event) {
+    if (!(event.ctrlKey || document.activeElement === this.svg)) return;
+    event.preventDefault();
+    this.prepare();
+    this.zoom(Math.exp(-event.deltaY / 300));
+  }
+
+  key(event) {
+    const way = { ArrowLeft: [-15, 0], ArrowRight: [15, 0], ArrowUp: [0, 15], ArrowDown: [0, -15] };
+    if (!(event.key in way && event.shiftKey)) { super.key(event); return; }
+    this.prepare();
+    this.turned(...way[event.key]);
+    event.preventDefault();
+  }
+
+  zoom(factor) {
+    this.scale = Math.min(Math.max(this.scale * factor, 0.5), LARGEST);
+    this.draw();
+  }
+
+  reset() {
+    this.scale = 1;
+    this.turn = [...this.first];
+    this.draw();
+  }
+
+  draw() {
+    const unit = Number(this.svg.dataset.scale) * this.scale, middle = this.view.width / 2;
+    const [lon, lat] = this.turn.map(angle => angle * Math.PI / 180);
+    const [s, c, sn, cn] = [Math.sin(lon), Math.cos(lon), Math.sin(lat), Math.cos(lat)];
+    const place = ([x, y, z]) => {
+      const right = c * y - s * x, outward = c * x + s * y;
+      const up = cn * z - sn * outward, depth = cn * outward + sn * z;
+      const seen = depth >= 0 || Math.hypot(right, up) > EARTH;
+      return [middle + unit * right, middle - unit * up, seen];
+    };
+    this.earth.setAttribute("r", EARTH * unit);
+    for (const [path, points] of this.paths) {
+      let before = false, drawn = "";
+      for (const [x, y, seen] of points.map(place)) {
+        if (seen) drawn += (before ? "L" : "M") + x.toFixed(1) + " " + y.toFixed(1);
+        before = seen;
+      }
+      path.setAttribute("d", drawn);
+    }
+    this.places = this.points.map((point, k) => {
+      const [x, y, seen] = place(point), dot = this.dots[k];
+      dot.setAttribute("x", x);
+      dot.setAttribute("y", y);
+      dot.setAttribute("visibility", seen ? "visible" : "hidden");
+      return seen ? [x, y] : [NaN, NaN];
+    });
+    if (this.chosen >= 0) this.choose(this.inside(this.places[this.chosen]) ? this.chosen : -1);
+  }
+}
 Picture.count = 0;
 Picture.active = null; // the one with a text
 addEventListener("scroll", () => { if (Picture.active) Picture.active.choose(Picture.active.chosen); },
@@ -303,7 +410,8 @@ addEventListener("pointerdown", event => {
   if (Picture.active && !event.target.closest("figure")) Picture.active.choose(-1);
 });
 
-for (const svg of document.querySelectorAll("svg.plot[tabindex]")) new Picture(svg);
+for (const svg of document.querySelectorAll("svg.plot[tabindex]"))
+  svg.dataset.turn ? new Globe(svg) : new Picture(svg);
 document.documentElement.classList.add("live");
 
 // A part that is closed opens where a link leads to it, and all of them for printing.

@@ -30,7 +30,7 @@ from epipole.tasks.report.night_facts import (
     needs_look,
     percent,
 )
-from epipole.tasks.report.object_sections import epipolar, objects, sky, trend
+from epipole.tasks.report.object_sections import epipolar, globe, objects, sky, trend
 from epipole.tasks.report.sensor_sections import (
     attitudes,
     coverage,
@@ -44,7 +44,8 @@ from epipole.tasks.report.sensor_sections import (
 MAX_LOOKS = 12
 HELP = (
     "Point at a dot of a picture to see what it is; a click leads to its object. By keyboard: the "
-    "arrows go from dot to dot, Enter follows, + and - zoom, Shift with arrows moves, 0 shows all."
+    "arrows go from dot to dot, Enter follows, + and - zoom, Shift with arrows moves or turns, "
+    "0 shows all."
 )
 MAX_LOGS = 50
 LARGEST_PAGE = 1_450_000  # bytes: below the 1.5 MB that docs/report.md promises
@@ -59,7 +60,7 @@ def night_page(facts: NightFacts) -> str:
     Where it would be longer than `LARGEST_PAGE`, fewer observations of its objects are drawn.
     """
     before = [counts(facts), coverage(facts), sigmas(facts), attitudes(facts), star_map(facts),
-              image_residuals(facts), sky(facts), epipolar(facts)]  # fmt: skip
+              image_residuals(facts), sky(facts), globe(facts), epipolar(facts)]  # fmt: skip
     after = [trend(facts), logs(facts)]
     every = 1
     while True:
