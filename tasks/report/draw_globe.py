@@ -19,8 +19,8 @@ Array = npt.NDArray[np.float64]
 
 SIZE_PT = 266.0  # as wide as the other pictures
 MARGIN_PT = 8.0
-LATITUDE_DEG = 20.0  # from where it is seen at first
-LONGITUDES_DEG = range(0, 360, 15)  # of these the one from where most dots are seen
+# It is seen at first from where most dots are seen, and farthest apart from each other.
+LATITUDES_DEG, LONGITUDES_DEG = range(-60, 61, 20), range(0, 360, 15)
 FARTHEST_KM = 60_000.0  # what is farther away is outside the picture until it is made smaller
 STEPS = 6  # parts of a line of sight, each of which may be behind the Earth
 
@@ -73,8 +73,12 @@ def draw_globe(globe: Globe, about: Mapping[str, str], anchors: Mapping[str, str
 
 
 def _best_side(dots: Array, scale: float) -> _Side:
-    sides = [_Side(float(lon), LATITUDE_DEG, scale) for lon in LONGITUDES_DEG]
-    return max(sides, key=lambda side: int(side.project(dots)[1].sum()))
+    def shows(side: _Side) -> tuple[int, float]:
+        points, seen = side.project(dots)
+        return int(seen.sum()), float(points[seen].var(axis=0).sum()) if seen.any() else 0.0
+
+    sides = [_Side(float(x), float(y), scale) for y in LATITUDES_DEG for x in LONGITUDES_DEG]
+    return max(sides, key=shows)
 
 
 def _graticule() -> list[Array]:
