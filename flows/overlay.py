@@ -3,6 +3,7 @@
 It is written half an hour at a time, so that a night of any size fits into memory.
 """
 
+import json
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -21,6 +22,7 @@ from epipole.schemas.bridge import array, to_polars
 from epipole.schemas.errors import DatasetError, LogError, NoFramesError
 from epipole.schemas.options import star_ids
 from epipole.schemas.spans import DAY_NS, SPAN_NS, Span, day_of
+from epipole.tasks.overlay.layout import viewer_layout
 from epipole.tasks.overlay.messages import (
     OBJECTS,
     SCENE,
@@ -43,6 +45,7 @@ class Overlay:
     """What was written."""
 
     out: str
+    layout: str
     nights: list[str]
     frames: int
     epochs: int
@@ -70,7 +73,7 @@ class _Logs:
 def overlay(
     dataset: str, logs: Sequence[str], out: Path, night: str | None = None, images: bool = False
 ) -> Overlay:
-    """Write what the dataset says of the frames of the logs.
+    """Write what the dataset says of the frames of the logs, and a layout of panels beside it.
 
     Parameters
     ----------
@@ -97,11 +100,18 @@ def overlay(
                 _calibrations(file, given, date)
                 for message in _of_night(dataset, date, given, images, counts):
                     file.message(message.topic, message.schema, message.time_ns, message.data)
+        layout = out.with_suffix(".layout.json")
+        panels = viewer_layout(given.frames["sensor_id"].unique().sort().to_list())
+        layout.write_text(json.dumps(panels, indent=1) + "\n")
     except OSError as error:
         raise DatasetError(f"{out}: cannot be written: {error.strerror}; give another") from error
     asked_frames = given.frames.filter(pl.col("time").dt.date().cast(pl.String).is_in(nights))
     return Overlay(
-        str(out), nights, **counts, without_rows=max(len(asked_frames) - counts["frames"], 0)
+        str(out),
+        str(layout),
+        nights,
+        **counts,
+        without_rows=max(len(asked_frames) - counts["frames"], 0),
     )
 
 

@@ -20,7 +20,6 @@ SMALL = {
     "tasks/algorithms/tracking/linking": "a published method beside the default",
     "tasks/calibrate": "a stage",
     "tasks/track": "a stage",
-    "tasks/overlay": "a flow's tasks",
     "tasks/simulate": "a flow's tasks: the pipeline may not read it",
 }
 MAX_MODULE_LINES = 600

@@ -293,7 +293,7 @@ def overlay(
 
     Stars ringed and named, objects with their ids, calibrations, sensors and objects in
     space with their lines of sight, and what was left out, at the times of the frames.
-    Open it together with the log.
+    Open it together with the log, with the layout of panels that is written beside it.
     """
     from epipole.flows.overlay import overlay as write
 
@@ -305,6 +305,7 @@ def overlay(
     print_lines(
         [
             f"file    {made.out}",
+            f"layout  {made.layout}",
             f"nights  {', '.join(made.nights)}",
             f"frames  {made.frames:,} annotated, {made.epochs:,} epochs",
             f"log     {made.log_lines:,} lines",

@@ -1,7 +1,8 @@
 """Sensors and objects in space, as messages that a viewer draws in three dimensions.
 
 The frame is GCRF, lengths are metres. What is small beside the Earth is drawn large enough to be
-seen: an object is a sphere of `SEEN_KM`, and around it stands its error ellipsoid of three sigma.
+seen: an object is a pale sphere of `SEEN_KM` by which it is found, and inside or around it a solid
+error ellipsoid of three sigma.
 """
 
 from collections.abc import Mapping, Sequence
@@ -69,7 +70,7 @@ def objects(
         entity = _entity(message, time_ns, row["object_id"])
         entity.lifetime.seconds, entity.lifetime.nanos = divmod(lifetime_ns, 1_000_000_000)
         position = [row[name] for name in POSITION]
-        _sphere(entity, position, [SEEN_KM] * 3, ORANGE, 0.9)
+        _sphere(entity, position, [SEEN_KM] * 3, ORANGE, 0.25)
         _ellipsoid(entity, row)
         label = entity.texts.add(text=row["object_id"], font_size=14.0, billboard=True)
         label.scale_invariant = True
@@ -99,7 +100,7 @@ def _ellipsoid(entity: Any, row: dict[str, Any]) -> None:
     if np.linalg.det(vectors) < 0:  # a reflection: a rotation has determinant 1
         vectors[:, 0] = -vectors[:, 0]
     axes_km = 2 * SIGMAS * np.sqrt(np.maximum(values, 0))
-    ball = _sphere(entity, [row[name] for name in POSITION], axes_km, ORANGE, 0.3)
+    ball = _sphere(entity, [row[name] for name in POSITION], axes_km, ORANGE, 0.9)
     turn = ball.pose.orientation
     turn.x, turn.y, turn.z, turn.w = quaternion_from_matrix(vectors).tolist()
 

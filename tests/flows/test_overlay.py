@@ -3,6 +3,7 @@
 import json
 import shutil
 from collections import Counter, defaultdict
+from pathlib import Path
 
 import numpy as np
 import polars as pl
@@ -15,6 +16,7 @@ from typer.testing import CliRunner
 from epipole.flows.command_line.main import app
 from epipole.flows.overlay import overlay
 from epipole.schemas.errors import DatasetError, NoFramesError
+from epipole.tasks.overlay.layout import viewer_layout
 
 NIGHT = "2019-04-01"
 
@@ -191,6 +193,40 @@ def test_a_night_without_positions_still_has_its_stars(night_log, night_dataset,
     drawn = messages(tmp_path / "x.mcap")["foxglove.ImageAnnotations"]
     assert all(m.circles for _, _, m in drawn)
     assert not any("HIP" in text.text for _, _, m in drawn for text in m.texts)
+
+
+def test_the_layout_has_panels_of_topics_that_are_there(written):
+    path, made, found = written
+    layout = json.loads(Path(made.layout).read_text())
+    topics = {topic for of_schema in found.values() for topic, _, _ in of_schema}
+    asked = set()
+    for name, panel in layout["configById"].items():
+        if name.startswith("Image!"):
+            mode = panel["imageMode"]
+            asked |= {mode["imageTopic"], mode["calibrationTopic"], *mode["annotations"]}
+        elif name.startswith("3D!"):
+            asked |= set(panel["topics"])
+            assert panel["followTf"] == "GCRF"
+        else:
+            asked.add(panel["topicToRender"])
+    assert asked <= topics | {"/epipole/rejects"}
+    assert asked >= {"/sat1/image", "/sat4/annotations", "/epipole/objects"}
+    assert sorted(panels_of(layout["layout"])) == sorted(layout["configById"])
+    assert Path(made.layout) == path.with_suffix(".layout.json")
+
+
+def panels_of(layout) -> list[str]:
+    if isinstance(layout, str):
+        return [layout]
+    assert 0 < layout["splitPercentage"] < 100
+    return panels_of(layout["first"]) + panels_of(layout["second"])
+
+
+@pytest.mark.parametrize("count", [0, 1, 2, 9])
+def test_any_number_of_sensors_has_a_layout(count):
+    layout = viewer_layout([f"s{k}" for k in range(count)])
+    assert sorted(panels_of(layout["layout"])) == sorted(layout["configById"])
+    assert len(layout["configById"]) == min(count, 4) + 2
 
 
 def test_the_command_tells_what_it_wrote(night_log, night_dataset, tmp_path):
