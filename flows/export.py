@@ -1,4 +1,4 @@
-"""Export a night's objects as messages for orbit determination: CCSDS TDM, OEM, OPM and OCM."""
+"""Export a night's objects as messages: CCSDS TDM, OEM, OPM and OCM; observations as ADES."""
 
 import shutil
 import tempfile
@@ -8,6 +8,7 @@ from typing import NamedTuple
 
 import polars as pl
 
+from epipole.io.ades import catalogue_name, observation_file
 from epipole.io.ccsds import (
     Directions,
     Ephemeris,
@@ -19,11 +20,11 @@ from epipole.io.ccsds import (
     tracking_data,
     write_message,
 )
-from epipole.io.datasets.dataset import nights_in, read_table
+from epipole.io.datasets.dataset import night_row, nights_in, read_table
 from epipole.io.paths import fault_of_name
 from epipole.schemas.bridge import to_polars
 from epipole.schemas.errors import DatasetError
-from epipole.schemas.options import Message, MessageFrame
+from epipole.schemas.options import Message, MessageFrame, star_ids
 from epipole.tasks.export import (
     arcs,
     directions,
@@ -68,7 +69,7 @@ def export(kind: Message, dataset: str, night: str, out: Path, wanted: Wanted = 
     list of str
         The names of the files: of TDMs one per object, one per sensor with its tracklets that
         belong to none, and an ephemeris per sensor; of OEMs one per object; of OPMs and OCMs one
-        per orbit, or per state of an object without orbit.
+        per orbit, or per state of an object without orbit; of ADES one for all.
 
     Raises
     ------
@@ -82,6 +83,8 @@ def export(kind: Message, dataset: str, night: str, out: Path, wanted: Wanted = 
     with tempfile.TemporaryDirectory(prefix=".export-", dir=_parent(out)) as made:
         if kind == Message.tdm:
             _write_tracking_data(tables, wanted.object_ids, Path(made))
+        elif kind == Message.ades:
+            _write_observations(tables, wanted.object_ids, Path(made))
         else:
             _write_states(kind, tables, wanted, Path(made))
         files = sorted(path.name for path in Path(made).iterdir())
@@ -103,6 +106,11 @@ class _NightTables:
     def read(self, table: str) -> pl.DataFrame:
         return to_polars(read_table(self.dataset, table, self.night))
 
+    @property
+    def subjects(self) -> Mapping[str, Subject]:
+        """The objects and tracklets that have a name."""
+        return self._subjects
+
     def subject(self, name: str) -> Subject:
         """Return an object or a tracklet with what is known of it."""
         return self._subjects.get(name, Subject(name))
@@ -120,7 +128,11 @@ class _NightTables:
             )
 
 
-def _write_tracking_data(night: _NightTables, wanted: Sequence[str], folder: Path) -> None:
+ByName = dict[str, pl.DataFrame]
+
+
+def _observed(night: _NightTables, wanted: Sequence[str]) -> tuple[ByName, ByName]:
+    """Return OBSERVATIONS of each object, and of each tracklet without; of those asked for."""
     rows = night.read("observations")
     objects = night.by_id(rows, "object_id")
     # Rows of an object's tracklet that do not show it are left out.
@@ -131,6 +143,23 @@ def _write_tracking_data(night: _NightTables, wanted: Sequence[str], folder: Pat
         objects, tracklets = (
             {name: of[name] for name in wanted if name in of} for of in (objects, tracklets)
         )
+    return objects, tracklets
+
+
+def _write_observations(night: _NightTables, wanted: Sequence[str], folder: Path) -> None:
+    """Write the observations of all objects and tracklets, in order of time."""
+    objects, tracklets = _observed(night, wanted)
+    found = [*objects.values(), *tracklets.values()]
+    if found:
+        row = night_row(night.dataset, night.night)
+        ids = "" if row is None else star_ids(row["star_catalogue_key"].partition(" ")[0])
+        rows = pl.concat(found).sort("time", "sensor_id", "tracklet_id")
+        text = observation_file(rows, night.subjects, catalogue_name(ids))
+        write_message(folder / f"{night.night}.psv", text)
+
+
+def _write_tracking_data(night: _NightTables, wanted: Sequence[str], folder: Path) -> None:
+    objects, tracklets = _observed(night, wanted)
     sensors = {name for of in (*objects.values(), *tracklets.values()) for name in of["sensor_id"]}
     ephemerides = _file_names(sorted(sensors), "oem")
     frames = night.read("frames")

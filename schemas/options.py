@@ -109,17 +109,19 @@ class Runner(StrEnum):
 
 
 class Message(StrEnum):
-    """A kind of CCSDS message: tracking data, an ephemeris, a state, an ephemeris and who it is."""
+    """A kind of message: of CCSDS tracking data, an ephemeris, a state, an ephemeris and who it is;
+    of the IAU observations (ADES)."""
 
     tdm = "tdm"
     oem = "oem"
     opm = "opm"
     ocm = "ocm"
+    ades = "ades"
 
     @property
     def table(self) -> str:
         """The tables that it is made from."""
-        return "observations" if self is Message.tdm else "orbits or states"
+        return "observations" if self in (Message.tdm, Message.ades) else "orbits or states"
 
 
 class MessageFrame(StrEnum):

@@ -13,7 +13,6 @@ MODULES = sorted(path for folder in FOLDERS for path in (ROOT / folder).rglob("*
 MIN_MODULES = 4  # of a package, its __init__.py aside
 # Smaller packages, each with its reason.
 SMALL = {
-    "io": "the rest of it is sub-packages",
     "io/simulation": "the simulator's own: the pipeline may not read it",
     "tasks": "the stages are sub-packages",
     "tasks/algorithms/sensor_faults": "above all other mathematics",

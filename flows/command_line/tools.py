@@ -223,7 +223,7 @@ MAX_AHEAD_H = 21 * 24.0  # services that screen ephemerides take 21 days
 
 
 def export(
-    message: Annotated[Message, typer.Argument(metavar="KIND", help="tdm, oem, opm or ocm.")],
+    message: Annotated[Message, typer.Argument(metavar="KIND", help="tdm, oem, opm, ocm or ades.")],
     dataset: Annotated[
         str,
         typer.Argument(metavar="DATASET", help="Folder or URL that `epipole run` published to."),
@@ -235,11 +235,12 @@ def export(
         typer.Option(
             "--object",
             metavar="ID",
-            help="Only this object, or tracklet of a tdm; may be given again.",
+            help="Only this object, or tracklet of a tdm or ades; may be given again.",
         ),
     ] = None,
     frame: Annotated[
-        MessageFrame, typer.Option(help="Reference frame of states and covariances; not of a tdm.")
+        MessageFrame,
+        typer.Option(help="Reference frame of states and covariances; not of a tdm or ades."),
     ] = MessageFrame.GCRF,
     ahead_h: Annotated[
         float,
@@ -253,7 +254,7 @@ def export(
     ] = 0.0,
     as_json: AsJson = False,
 ) -> None:
-    """Write a night's objects as CCSDS messages for orbit determination (KVN).
+    """Write a night's objects as messages for orbit determination: CCSDS (KVN) or ADES (PSV).
 
     tdm: the directions of each object, and of tracklets without (TDM 2.0), with an ephemeris of
     each sensor
@@ -263,6 +264,8 @@ def export(
     opm: each orbit, or state, with its covariance (OPM 3.0)
 
     ocm: as oem, with the numbers of a catalogue (OCM 3.0)
+
+    ades: each direction with its sigmas, from where its sensor was (ADES 2022)
     """
     from epipole.flows.export import Wanted, export
 

@@ -49,6 +49,24 @@ def test_tracking_data_are_the_observations_and_their_sensors_places(night_datas
     assert np.isclose(near, first["x_km"], rtol=0, atol=1e-6).any()
 
 
+def test_observations_as_ades_are_all_of_them_or_those_asked_for(night_dataset, tmp_path):
+    rows = observed(night_dataset)
+    files = export(Message.ades, str(night_dataset), NIGHT, tmp_path / "all")
+    assert files == [f"{NIGHT}.psv"]
+    lines = (tmp_path / "all" / files[0]).read_text().splitlines()
+    # Rows of an object's tracklet that do not show it are left out, as in a TDM.
+    alone = rows.filter(pl.col("object_id").is_null().all().over("tracklet_id"))
+    assert len(lines) - 2 == len(rows.drop_nulls("object_id")) + len(alone)
+    assert {line.split("|")[lines[1].split("|").index("astCat")] for line in lines[2:]} == {"Hip2"}
+    name = rows["object_id"].drop_nulls()[0]
+    export(Message.ades, str(night_dataset), NIGHT, tmp_path / "one", Wanted([name]))
+    lines = (tmp_path / "one" / files[0]).read_text().splitlines()
+    assert len(lines) - 2 == len(rows.filter(object_id=name))
+    assert all(f"object {name}, " in line for line in lines[2:])
+    with pytest.raises(DatasetError, match="has no observations of nobody"):
+        export(Message.ades, str(night_dataset), NIGHT, tmp_path / "none", Wanted(["nobody"]))
+
+
 def changed(dataset, folder, **tables):
     """A copy of the dataset in which some tables are what their functions return of them."""
     shutil.copytree(dataset, folder)
