@@ -24,7 +24,7 @@ from epipole.io.datasets.dataset import night_row, nights_in, read_table
 from epipole.io.paths import fault_of_name
 from epipole.schemas.bridge import to_polars
 from epipole.schemas.errors import DatasetError
-from epipole.schemas.options import Message, MessageFrame, star_ids
+from epipole.schemas.options import Message, MessageForm, MessageFrame, star_ids
 from epipole.tasks.export import (
     arcs,
     directions,
@@ -56,6 +56,7 @@ class Wanted(NamedTuple):
     object_ids: Sequence[str] = ()
     frame: MessageFrame = MessageFrame.GCRF
     ahead_h: float = 0.0
+    form: MessageForm = MessageForm.kvn
 
 
 ALL = Wanted()
@@ -82,7 +83,7 @@ def export(kind: Message, dataset: str, night: str, out: Path, wanted: Wanted = 
     tables = _NightTables(dataset, night)
     with tempfile.TemporaryDirectory(prefix=".export-", dir=_parent(out)) as made:
         if kind == Message.tdm:
-            _write_tracking_data(tables, wanted.object_ids, Path(made))
+            _write_tracking_data(tables, wanted, Path(made))
         elif kind == Message.ades:
             _write_observations(tables, wanted.object_ids, Path(made))
         else:
@@ -97,23 +98,18 @@ def export(kind: Message, dataset: str, night: str, out: Path, wanted: Wanted = 
 
 
 class _NightTables:
-    """The tables of a night."""
+    """The tables of a night; `subjects` are the objects and tracklets that have a name."""
 
     def __init__(self, dataset: str, night: str) -> None:
         self.dataset, self.night = dataset, night
-        self._subjects = subjects(self.read("identifications"))
+        self.subjects = subjects(self.read("identifications"))
 
     def read(self, table: str) -> pl.DataFrame:
         return to_polars(read_table(self.dataset, table, self.night))
 
-    @property
-    def subjects(self) -> Mapping[str, Subject]:
-        """The objects and tracklets that have a name."""
-        return self._subjects
-
     def subject(self, name: str) -> Subject:
         """Return an object or a tracklet with what is known of it."""
-        return self._subjects.get(name, Subject(name))
+        return self.subjects.get(name, Subject(name))
 
     def by_id(self, rows: pl.DataFrame, key: str) -> dict[str, pl.DataFrame]:
         """Return the rows of each object or tracklet, in the order of the ids."""
@@ -158,21 +154,22 @@ def _write_observations(night: _NightTables, wanted: Sequence[str], folder: Path
         write_message(folder / f"{night.night}.psv", text)
 
 
-def _write_tracking_data(night: _NightTables, wanted: Sequence[str], folder: Path) -> None:
-    objects, tracklets = _observed(night, wanted)
+def _write_tracking_data(night: _NightTables, wanted: Wanted, folder: Path) -> None:
+    objects, tracklets = _observed(night, wanted.object_ids)
     sensors = {name for of in (*objects.values(), *tracklets.values()) for name in of["sensor_id"]}
-    ephemerides = _file_names(sorted(sensors), "oem")
+    ephemerides = _file_names(sorted(sensors), _ending("oem", wanted.form))
     frames = night.read("frames")
     for sensor, file in ephemerides.items():
         of_sensor = sensor_ephemeris(frames.filter(pl.col("sensor_id") == sensor))
-        write_message(folder / file, ephemeris_message(Subject(sensor), [of_sensor], [OF_SENSOR]))
+        text = ephemeris_message(Subject(sensor), [of_sensor], [OF_SENSOR], wanted.form)
+        write_message(folder / file, text)
     segments: dict[str, list[tuple[Subject, str, Directions]]] = {}
     for name, of in (*objects.items(), *tracklets.items()):
         for sensor, seen in directions(of, ephemerides).items():
             group = name if name in objects else sensor  # a sensor's tracklets are one message
             segments.setdefault(group, []).append((night.subject(name), sensor, seen))
-    for name, file in _file_names(list(segments), "tdm").items():
-        write_message(folder / file, tracking_data(segments[name]))
+    for name, file in _file_names(list(segments), _ending("tdm", wanted.form)).items():
+        write_message(folder / file, tracking_data(segments[name], wanted.form))
 
 
 def _write_states(kind: Message, night: _NightTables, wanted: Wanted, folder: Path) -> None:
@@ -186,7 +183,7 @@ def _write_states(kind: Message, night: _NightTables, wanted: Wanted, folder: Pa
     around = surroundings_of(night.night, round(wanted.ahead_h * HOUR_NS))
     origin_ns = noon_ns(night.night)
     positions = night.read("positions") if moved else pl.DataFrame()
-    for name, file in _file_names(names, kind.value).items():
+    for name, file in _file_names(names, _ending(kind.value, wanted.form)).items():
         orbit = orbits.get(name)
         if orbit is not None:
             comments = [OF_ORBIT, OF_FORCES, orbit["forces"]]
@@ -199,20 +196,26 @@ def _write_states(kind: Message, night: _NightTables, wanted: Wanted, folder: Pa
         else:
             comments, parts = [OF_STATE], single_states(states[name].sort("epoch"))
         parts = [in_frame(part, wanted.frame.value) for part in parts]
-        _write_parts(kind, folder / file, night.subject(name), parts, comments)
+        _write_parts(kind, folder / file, night.subject(name), parts, comments, wanted.form)
 
 
 def _write_parts(
-    kind: Message, path: Path, of: Subject, parts: Sequence[Ephemeris], comments: Sequence[str]
-) -> None:
+    kind: Message, path: Path, of: Subject, parts: Sequence[Ephemeris], comments: Sequence[str],
+    form: MessageForm,
+) -> None:  # fmt: skip
     """Write an OEM of all parts, or a numbered OPM or OCM of each."""
     if kind == Message.oem:
-        write_message(path, ephemeris_message(of, parts, comments))
+        write_message(path, ephemeris_message(of, parts, comments, form))
         return
     message = state_message if kind == Message.opm else comprehensive_message
     for number, part in enumerate(parts, 1):
-        numbered = path.with_name(f"{path.stem}-{number}{path.suffix}")
-        write_message(numbered, message(of, part, comments))
+        stem, _, ending = path.name.rpartition(f".{kind.value}")
+        numbered = path.with_name(f"{stem}-{number}.{kind.value}{ending}")
+        write_message(numbered, message(of, part, comments, form))
+
+
+def _ending(kind: str, form: MessageForm) -> str:
+    return kind if form == MessageForm.kvn else f"{kind}.{form.value}"
 
 
 def _file_names(names: Sequence[str], ending: str) -> Mapping[str, str]:

@@ -1,4 +1,7 @@
-"""CCSDS messages for orbit determination: OEM, OPM and OCM (502.0-B-3), TDM (503.0-B-2)."""
+"""CCSDS messages for orbit determination: OEM, OPM and OCM (502.0-B-3), TDM (503.0-B-2).
+
+As keywords with values (`form` kvn), or in XML (505.0-B-3).
+"""
 
 import datetime
 import re
@@ -107,10 +110,12 @@ class Ephemeris(NamedTuple):
     frame: str = "GCRF"
 
 
-def ephemeris_message(of: Subject, parts: Sequence[Ephemeris], comments: Sequence[str]) -> str:
+def ephemeris_message(
+    of: Subject, parts: Sequence[Ephemeris], comments: Sequence[str], form: str = "kvn"
+) -> str:
     """Return the OEM of one object or sensor, with a segment per part."""
     segments = [_ephemeris_segment(of, part, comments) for part in parts]
-    return str(ccsds.Oem(_header(), segments).to_str("kvn"))
+    return str(ccsds.Oem(_header(), segments).to_str(form))
 
 
 def _ephemeris_segment(of: Subject, part: Ephemeris, comments: Sequence[str]) -> ccsds.OemSegment:
@@ -139,7 +144,7 @@ def _ephemeris_segment(of: Subject, part: Ephemeris, comments: Sequence[str]) ->
     return ccsds.OemSegment(metadata, ccsds.OemData(states, covariances))
 
 
-def state_message(of: Subject, part: Ephemeris, comments: Sequence[str]) -> str:
+def state_message(of: Subject, part: Ephemeris, comments: Sequence[str], form: str = "kvn") -> str:
     """Return the OPM of one state, with its covariance."""
     metadata = ccsds.OpmMetadata(
         of.message_name, of.message_id, center_name="EARTH", ref_frame=part.frame,
@@ -153,10 +158,12 @@ def state_message(of: Subject, part: Ephemeris, comments: Sequence[str]) -> str:
             for i, j in zip(*np.tril_indices(6), strict=True)
         }
     )
-    return str(ccsds.Opm(_header(), ccsds.OpmSegment(metadata, data)).to_str("kvn"))
+    return str(ccsds.Opm(_header(), ccsds.OpmSegment(metadata, data)).to_str(form))
 
 
-def comprehensive_message(of: Subject, part: Ephemeris, comments: Sequence[str]) -> str:
+def comprehensive_message(
+    of: Subject, part: Ephemeris, comments: Sequence[str], form: str = "kvn"
+) -> str:
     """Return the OCM of one object: its ephemeris, with the covariance of each state."""
     at = times(part.time_ns)
     metadata = ccsds.OcmMetadata(
@@ -181,7 +188,7 @@ def comprehensive_message(of: Subject, part: Ephemeris, comments: Sequence[str])
     )  # fmt: skip
     data = ccsds.OcmData()
     data.traj, data.cov = [trajectory], [covariance]
-    return str(ccsds.Ocm(_header(), ccsds.OcmSegment(metadata, data)).to_str("kvn"))
+    return str(ccsds.Ocm(_header(), ccsds.OcmSegment(metadata, data)).to_str(form))
 
 
 def _header() -> ccsds.OdmHeader:
@@ -214,12 +221,12 @@ class Directions(NamedTuple):
     comments: Sequence[str]
 
 
-def tracking_data(seen: Iterable[tuple[Subject, str, Directions]]) -> str:
+def tracking_data(seen: Iterable[tuple[Subject, str, Directions]], form: str = "kvn") -> str:
     """Return a message with a segment for each object or tracklet and its sensor."""
     segments = [_tracking_segment(*of) for of in seen]
     header = ccsds.TdmHeader(originator=ORIGINATOR, creation_date=now())
     message = ccsds.Tdm(header=header, body=ccsds.TdmBody(segments=segments))
-    return str(message.to_str("kvn"))
+    return str(message.to_str(form))
 
 
 def _tracking_segment(of: Subject, sensor: str, seen: Directions) -> ccsds.TdmSegment:

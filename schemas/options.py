@@ -124,6 +124,13 @@ class Message(StrEnum):
         return "observations" if self in (Message.tdm, Message.ades) else "orbits or states"
 
 
+class MessageForm(StrEnum):
+    """How CCSDS messages are written: keywords with values, or XML."""
+
+    kvn = "kvn"
+    xml = "xml"
+
+
 class MessageFrame(StrEnum):
     """The reference frame of states in messages."""
 

@@ -23,7 +23,7 @@ from epipole.flows.command_line.options import (
 )
 from epipole.flows.prefect.server_process import new_secret
 from epipole.schemas.errors import EpipoleError
-from epipole.schemas.options import STAR_CATALOGUES, Message, MessageFrame
+from epipole.schemas.options import STAR_CATALOGUES, Message, MessageForm, MessageFrame
 
 
 def report(
@@ -252,9 +252,12 @@ def export(
             help="How long orbits go on after their arc, in an oem or ocm.",
         ),
     ] = 0.0,
+    form: Annotated[
+        MessageForm, typer.Option(help="Keywords with values (KVN), or XML; not of ades.")
+    ] = MessageForm.kvn,
     as_json: AsJson = False,
 ) -> None:
-    """Write a night's objects as messages for orbit determination: CCSDS (KVN) or ADES (PSV).
+    """Write a night's objects as messages for orbit determination: CCSDS (KVN, XML) or ADES (PSV).
 
     tdm: the directions of each object, and of tracklets without (TDM 2.0), with an ephemeris of
     each sensor
@@ -270,7 +273,7 @@ def export(
     from epipole.flows.export import Wanted, export
 
     check_night(night)
-    files = export(message, dataset, night, out, Wanted(object_ids or (), frame, ahead_h))
+    files = export(message, dataset, night, out, Wanted(object_ids or (), frame, ahead_h, form))
     if as_json:
         print_json({"folder": str(out), "files": files})
     else:

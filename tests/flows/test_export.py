@@ -1,5 +1,6 @@
 """Export: what a night's tables say, as messages; all files or none, errors for people."""
 
+import re
 import shutil
 
 import ccsds_ndm as ccsds
@@ -12,7 +13,7 @@ from scenes.screening import faults_of
 from epipole.flows.export import Wanted, export
 from epipole.io.catalogues.earth_orientation import read_earth_orientation
 from epipole.schemas.errors import DatasetError
-from epipole.schemas.options import Message, MessageFrame
+from epipole.schemas.options import Message, MessageForm, MessageFrame
 from epipole.tasks.algorithms.orbits.reference_frames import orientation_at, to_gcrf
 
 NIGHT = "2019-04-01"
@@ -65,6 +66,31 @@ def test_observations_as_ades_are_all_of_them_or_those_asked_for(night_dataset, 
     assert all(f"object {name}, " in line for line in lines[2:])
     with pytest.raises(DatasetError, match="has no observations of nobody"):
         export(Message.ades, str(night_dataset), NIGHT, tmp_path / "none", Wanted(["nobody"]))
+
+
+# Times and names of files; comments, which the reader of KVN takes for the header's; and values
+# that are the default of the standard, which XML leaves out.
+UNLIKE = "(CREATION_DATE|EPHEMERIS_NAME|COMMENT|SCLK_|ORB_REVNUM_BASIS|ORB_AVERAGING).*"
+
+
+@pytest.mark.parametrize(
+    ("kind", "reader"),
+    [(Message.tdm, ccsds.Tdm), (Message.oem, ccsds.Oem), (Message.opm, ccsds.Opm),
+     (Message.ocm, ccsds.Ocm)],
+)  # fmt: skip
+def test_xml_says_what_kvn_says(kind, reader, night_dataset, tmp_path):
+    name = observed(night_dataset, "orbits")["object_id"][0]
+    texts = []
+    for form in MessageForm:
+        wanted = Wanted([name], form=form)
+        files = export(kind, str(night_dataset), NIGHT, tmp_path / form.value, wanted)
+        ending = f".{kind.value}" if form == MessageForm.kvn else f".{kind.value}.xml"
+        (file,) = (f for f in files if f.startswith(name))
+        assert file.endswith(ending)
+        message = reader.from_str((tmp_path / form.value / file).read_text())
+        texts.append(re.sub(UNLIKE, "", message.to_str("kvn")))
+    assert texts[0].split() == texts[1].split()
+    assert len(texts[0].split()) > 30
 
 
 def changed(dataset, folder, **tables):
