@@ -1,6 +1,7 @@
 """The files of a deployment: written as they are in the package, and valid for who reads them."""
 
 import configparser
+import datetime
 import fnmatch
 import os
 import shutil
@@ -10,6 +11,7 @@ from pathlib import Path
 import pytest
 import yaml
 from prefect.events.schemas.automations import AutomationCore
+from prefect.settings.models.root import Settings as SettingsRoot
 from typer.testing import CliRunner
 
 from epipole.flows.command_line.main import app
@@ -148,3 +150,12 @@ def test_systemd_finds_no_fault_in_the_units(written):
     said = subprocess.run(["systemd-analyze", "verify", *units], capture_output=True, text=True)
     ours = [line for line in said.stderr.splitlines() if "epipole" in line]
     assert ours == []
+
+
+def test_the_server_forgets_runs_after_a_quarter(written, monkeypatch):
+    for line in (written / "prefect.env").read_text().splitlines():
+        if "DB_VACUUM" in line:
+            monkeypatch.setenv(*line.split("=", 1))
+    vacuum = SettingsRoot().server.services.db_vacuum
+    assert vacuum.enabled_vacuum_types == {"events", "flow_runs", "orphans"}
+    assert vacuum.retention_period == datetime.timedelta(days=90)
