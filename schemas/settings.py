@@ -450,7 +450,7 @@ class WorkSettings(Group):
     """How the work of a night is divided."""
 
     memory_mib: int = Field(
-        512,
+        384,
         ge=64,
         le=16 * 1024**2,
         description="Memory that a task of `solve` takes at most, about [MiB]. Nights of many "

@@ -53,7 +53,7 @@ def publish_nights(
 
 # Slices of time: rows of a span from many parts, merged in slices that fit in memory.
 
-MAX_ROWS = 200_000  # in a slice, about
+MAX_ROWS = 1 << 17  # in a slice, about: a row group
 MAX_SAMPLED = 1_000_000  # times of rows by which a span is divided
 ROWS_OF_TABLE = 200  # with many tables a slice has more rows: each table is opened for each slice
 

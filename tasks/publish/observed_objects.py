@@ -6,17 +6,18 @@ position was solved without the tracklet, they are not. A tracklet that no other
 observations without an object, unless an orbit joins it to one.
 """
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from functools import partial
 from typing import Literal
 
 import polars as pl
 import pyarrow as pa
 
+from epipole.io.work.parts import read_part
 from epipole.schemas.bridge import concat, from_polars, to_polars
 from epipole.schemas.observation import FITTED_FIELDS
 from epipole.schemas.spans import Span
-from epipole.schemas.tables import ASSOCIATIONS, OBSERVATIONS
+from epipole.schemas.tables import OBSERVATIONS
 from epipole.schemas.work_tables import SHARED_ERRORS, SIGHTINGS
 from epipole.tasks.common.sightings import MARK
 from epipole.tasks.publish.hot_tracklets import hot_tracklets
@@ -56,19 +57,13 @@ def object_runs(parts: NightParts) -> pl.DataFrame:
         tracklet_id, object_id, used, first and last (epochs), sorted by first.
     """
     columns = ["epoch", "object_id", *_KEY, "tracklet_id", "used"]
-    schema = pa.schema([ASSOCIATIONS.field(name) for name in columns])
     spans = []
     for span in parts.all_spans:
-        pieces = (
-            parts.solved.read(span, "associations", columns) if parts.solved.holds(span) else []
-        )
-        if any(piece.num_rows for piece in pieces):
-            names = parts.names.get(span.folder, {})
-            rows = to_polars(concat(schema, pieces))
-            spans.append(runs_of_views(_named(rows, names)))
-    if not spans:
-        spans = [runs_of_views(to_polars(schema.empty_table()))]
-    return pl.concat(spans).sort("first", "tracklet_id", "object_id")
+        names = parts.names.get(span.folder, {})
+        pieces = parts.solved.pieces(span) if parts.solved.holds(span) else []
+        tables = (to_polars(read_part(piece, "associations", columns)) for piece in pieces)
+        spans.append(runs_of_views(_named(rows, names) for rows in tables))
+    return pl.concat([runs_of_views([]), *spans]).sort("first", "tracklet_id", "object_id")
 
 
 def _named(views: pl.DataFrame, names: Mapping[str, str]) -> pl.DataFrame:
@@ -77,26 +72,58 @@ def _named(views: pl.DataFrame, names: Mapping[str, str]) -> pl.DataFrame:
     return views.with_columns(named).drop_nulls("object_id")
 
 
-def runs_of_views(views: pl.DataFrame) -> pl.DataFrame:
-    """Return the runs of ASSOCIATIONS, as `object_runs` does; lone detections by their mark."""
-    lone = pl.format("{}{}-{}-{}", pl.lit(MARK), *_KEY)
-    without = pl.col("tracklet_id").is_null()
-    marked = views.filter(without).with_columns(tracklet_id=lone)
-    views = pl.concat([views.filter(without.not_()), marked]).drop_nulls("tracklet_id")
-    # Sorted by codes: texts take twice as long.
-    codes = pl.col("tracklet_id", "object_id").cast(pl.Categorical).to_physical()
-    views = views.with_columns(codes.name.suffix("_code"))
-    views = views.sort("tracklet_id_code", "epoch", "object_id")
-    member = pl.struct("tracklet_id_code", "object_id_code", "used")
-    return (
-        views.group_by(member.rle_id().alias("run"), maintain_order=True)
-        .agg(
-            pl.col("tracklet_id", "object_id", "used").first(),
-            pl.col("epoch").first().alias("first"),
-            pl.col("epoch").last().alias("last"),
-        )
-        .drop("run")
+def runs_of_views(pieces: Iterable[pl.DataFrame]) -> pl.DataFrame:
+    """Return the runs of ASSOCIATIONS, as `object_runs` does; lone detections by their mark.
+
+    Of each piece only codes of its texts stay in memory, a tenth of it.
+    """
+    tracklets, objects = _Codes(), _Codes()
+    coded = [_coded(views, tracklets, objects) for views in pieces]
+    views = pl.concat([pl.DataFrame(schema=_CODED), *coded])
+    views = views.sort("tracklet_id", "epoch", "object_id")
+    member = pl.struct("tracklet_id", "object_id", "used")
+    runs = views.group_by(member.rle_id().alias("run"), maintain_order=True).agg(
+        pl.col("tracklet_id", "object_id", "used").first(),
+        pl.col("epoch").first().alias("first"),
+        pl.col("epoch").last().alias("last"),
     )
+    return runs.drop("run").with_columns(
+        tracklet_id=tracklets.texts(runs["tracklet_id"]), object_id=objects.texts(runs["object_id"])
+    )
+
+
+_CODED = {
+    "tracklet_id": pl.UInt32, "object_id": pl.UInt32, "used": pl.Boolean,
+    "epoch": pl.Datetime("ns", "UTC"),
+}  # fmt: skip
+
+
+class _Codes:
+    """Whole numbers for texts, from 0, in the order of their first appearance."""
+
+    def __init__(self) -> None:
+        self._code: dict[str, int] = {}
+
+    def of(self, texts: pl.Series) -> pl.Series:
+        code = self._code
+        known = {
+            text: code.setdefault(text, len(code)) for text in texts.unique(maintain_order=True)
+        }
+        codes = texts.replace_strict(known, return_dtype=pl.UInt32) if known else texts
+        return codes.cast(pl.UInt32)
+
+    def texts(self, codes: pl.Series) -> pl.Series:
+        return pl.Series(codes.name, list(self._code), pl.String).gather(codes)
+
+
+def _coded(views: pl.DataFrame, tracklets: _Codes, objects: _Codes) -> pl.DataFrame:
+    lone = pl.format("{}{}-{}-{}", pl.lit(MARK), *_KEY)
+    views = views.with_columns(tracklet_id=pl.coalesce("tracklet_id", lone))
+    columns = [
+        tracklets.of(views["tracklet_id"]), objects.of(views["object_id"]), views["used"],
+        views["epoch"],
+    ]  # fmt: skip
+    return pl.DataFrame(columns)
 
 
 def with_objects(sightings: pl.DataFrame, runs: pl.DataFrame) -> pl.DataFrame:

@@ -24,7 +24,7 @@ from epipole.schemas.stages import Stage
 from epipole.tasks.common.stage_tasks import stage_task
 
 SHARED_OUT = {"observations": SHARED_SEEN, "positions": SHARED_SOLVED}
-ROWS_OF_PART = 1_000_000  # about; of `observations` they take 0.2 GB
+ROWS_OF_PART = 400_000  # about; of `observations` they take 0.1 GB
 
 
 @stage_task(Stage.PUBLISH, "objects of {night} among {shares} tasks")

@@ -13,7 +13,7 @@ import numpy.typing as npt
 from epipole.schemas.text import as_line
 from epipole.tasks.algorithms.constants import EARTH_RADIUS_KM
 from epipole.tasks.report.canvas import LONGEST_TEXT
-from epipole.tasks.report.globe import Globe
+from epipole.tasks.report.globe import Globe, Sight
 
 Array = npt.NDArray[np.float64]
 
@@ -22,7 +22,7 @@ MARGIN_PT = 8.0
 # It is seen at first from where most dots are seen, and farthest apart from each other.
 LATITUDES_DEG, LONGITUDES_DEG = range(-60, 61, 20), range(0, 360, 15)
 FARTHEST_KM = 60_000.0  # what is farther away is outside the picture until it is made smaller
-STEPS = 6  # parts of a line of sight, each of which may be behind the Earth
+STEPS = 6  # parts of a line of sight, each of which may be behind the Earth; page.js has it too
 
 
 class _Side(NamedTuple):
@@ -54,11 +54,8 @@ def draw_globe(globe: Globe, about: Mapping[str, str], anchors: Mapping[str, str
     parts = [
         f'<circle class="earth" cx="{SIZE_PT / 2:g}" cy="{SIZE_PT / 2:g}" r="{radius:.2f}"/>',
         _lines("grid", side, _graticule()),
-        _lines("sight", side, [_sampled(s.from_km, s.to_km) for s in globe.sights if s.object_id]),
-        _lines(
-            "sight lone", side, [_sampled(s.from_km, s.to_km) for s in globe.sights
-                                 if not s.object_id]
-        ),
+        _sights("sight", side, [s for s in globe.sights if s.object_id]),
+        _sights("sight lone", side, [s for s in globe.sights if not s.object_id]),
         _dots("blue", "mark2", side, (
             (f"{name}, {_height(r_km)}", "", r_km) for name, r_km in globe.sensors.items())),
         _dots("vermillion", "mark0", side, (
@@ -93,22 +90,29 @@ def _graticule() -> list[Array]:
     ]
 
 
-def _sampled(from_km: Array, to_km: Array) -> Array:
-    return from_km + np.linspace(0.0, 1.0, STEPS + 1)[:, None] * (to_km - from_km)
-
-
 def _lines(kind: str, side: _Side, lines: Iterable[Array]) -> str:
-    """Return lines; their parts behind the Earth are not drawn."""
-    parts = []
-    for line in lines:
-        points, seen = side.project(line)
-        drawn, before = [], False
-        for (x, y), is_seen in zip(points.tolist(), seen.tolist(), strict=True):
-            if is_seen:
-                drawn.append(f"{'L' if before else 'M'}{x:.1f} {y:.1f}")
-            before = is_seen
-        parts.append(f'<path d="{"".join(drawn)}" data-p="{_in_space(line)}"/>')
+    parts = [f'<path d="{_drawn(side, line)}" data-p="{_in_space(line)}"/>' for line in lines]
     return f'<g class="{kind}">{"".join(parts)}</g>'
+
+
+def _sights(kind: str, side: _Side, sights: Iterable[Sight]) -> str:
+    parts = []
+    for sight in sights:
+        ends = np.stack([sight.from_km, sight.to_km])
+        line = ends[0] + np.linspace(0.0, 1.0, STEPS + 1)[:, None] * (ends[1] - ends[0])
+        parts.append(f'<path d="{_drawn(side, line)}" data-p="{_in_space(ends)}"/>')
+    return f'<g class="{kind}">{"".join(parts)}</g>'
+
+
+def _drawn(side: _Side, line: Array) -> str:
+    """Return a line without its parts behind the Earth."""
+    points, seen = side.project(line)
+    drawn, before = [], False
+    for (x, y), is_seen in zip(points.tolist(), seen.tolist(), strict=True):
+        if is_seen:
+            drawn.append(f"{'L' if before else 'M'}{x:.1f} {y:.1f}")
+        before = is_seen
+    return "".join(drawn)
 
 
 def _dots(colour: str, mark: str, side: _Side, dots: Iterable[tuple[str, str, Array]]) -> str:

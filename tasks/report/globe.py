@@ -20,7 +20,7 @@ SEEN_NS = 15 * SECOND_NS  # observations so near to it are drawn
 MOVED_S = 1800.0  # longest time over which an orbit is moved: `propagate` knows point mass and J2
 SIGHT_KM = 2000.0  # length of a line of sight to nothing known
 # A page of more has no room for the other pictures.
-MAX_DOTS, MAX_LINES = 500, 600
+MAX_DOTS, MAX_LINES = 300, 300
 
 
 class Sight(NamedTuple):

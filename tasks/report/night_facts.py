@@ -185,7 +185,8 @@ def _concerned(
     wrong = {series.sensors[k] for k in np.flatnonzero(_is_poor(series))}
     if residuals is not None:
         wrong |= {name for name, _ in _residuals_off(residuals)}
-    order = sorted(wrong, key=lambda name: series.identified_share[series.sensors.index(name)])
+    share = {name: series.identified_share[series.sensors.index(name)] for name in wrong}
+    order = sorted(wrong, key=lambda name: (share[name], name))
     frames = {
         name: read_frame_concerned(night, series, series.sensors.index(name))
         for name in order[:MAX_CONCERNED]

@@ -1,5 +1,7 @@
 """The parts of the page about one object each: light curve, residuals by sensor, orbit."""
 
+from itertools import pairwise
+
 import polars as pl
 
 from epipole.tasks.report.dot_plot import Dots, draw_dots
@@ -68,24 +70,25 @@ def _every(detail: ObjectDetail) -> str:
 
 def _dots(detail: ObjectDetail, column: str, sigma: str) -> list[Dots]:
     known = detail.seen.drop_nulls(column).sort("sensor_id", "time")
-    groups = []
-    for (name,), rows in known.group_by("sensor_id", maintain_order=True):
-        time_ns = rows["time"].dt.epoch("ns").to_numpy()
-        sigmas = rows[sigma] if sigma else pl.Series([None] * len(rows), dtype=pl.Float64)
-        shown = sigmas.fill_null(float("nan")).to_numpy()
-        texts = [
-            f"{name} at {clock(t)}, frame {frame}: {value:.2f}"
-            + (f" ± {error:.2f}" if error == error else "")
-            + (", in the Earth's shadow" if sunlit is False else "")
-            for t, frame, value, error, sunlit in zip(
-                time_ns.tolist(), rows["frame_number"], rows[column], shown, rows["sunlit"],
-                strict=True,
-            )
-        ]  # fmt: skip
-        groups.append(
-            Dots(str(name), seconds_of_day(time_ns), rows[column].to_numpy(), shown, texts)
+    time_ns = known["time"].dt.epoch("ns")
+    x_s, y = seconds_of_day(time_ns.to_numpy()), known[column].to_numpy()
+    sigmas = known[sigma] if sigma else pl.Series([None] * len(known), dtype=pl.Float64)
+    shown = sigmas.cast(pl.Float64).fill_null(float("nan")).to_numpy()
+    names = known["sensor_id"].to_list()
+    texts = [
+        f"{name} at {clock(t)}, frame {frame}: {value:.2f}"
+        + (f" ± {error:.2f}" if error == error else "")
+        + (", in the Earth's shadow" if sunlit is False else "")
+        for name, t, frame, value, error, sunlit in zip(
+            names, time_ns.to_list(), known["frame_number"].to_list(), y.tolist(), shown.tolist(),
+            known["sunlit"].to_list(), strict=True,
         )
-    return groups
+    ]  # fmt: skip
+    first = [k for k in range(len(names)) if k == 0 or names[k] != names[k - 1]]
+    return [
+        Dots(names[a], x_s[a:b], y[a:b], shown[a:b], texts[a:b])
+        for a, b in pairwise([*first, len(names)])
+    ]
 
 
 def _by_sensor(detail: ObjectDetail) -> str:

@@ -297,6 +297,7 @@ class Picture {
 }
 
 const EARTH = 6.378137; // 1,000 km
+const STEPS = 6; // parts of a line of sight, each of which may be behind the Earth
 
 // A globe that turns. Its lines and dots have places in space, in units of 1,000 km.
 class Globe extends Picture {
@@ -315,7 +316,10 @@ class Globe extends Picture {
       return Array.from({ length: all.length / 3 }, (_, k) => all.slice(3 * k, 3 * k + 3));
     };
     this.points = this.dots.map(dot => read(dot)[0]);
-    this.paths = [...this.svg.querySelectorAll("path[data-p]")].map(path => [path, read(path)]);
+    const parts = ([from, to]) => Array.from({ length: STEPS + 1 }, (_, k) =>
+      from.map((value, axis) => value + k / STEPS * (to[axis] - value)));
+    this.paths = [...this.svg.querySelectorAll("path[data-p]")].map(path =>
+      [path, path.closest(".sight") ? parts(read(path)) : read(path)]);
     this.earth = this.svg.querySelector(".earth");
     this.draw();
   }

@@ -30,14 +30,19 @@ def runs(*views: tuple[str | None, str, float, bool]) -> pl.DataFrame:
     """The runs of these views: tracklet, object, second, whether it was used."""
     tracklet, object_, second, used = zip(*views, strict=True) if views else ((),) * 4
     time = to_polars(filled(SIGHTINGS, len(views), {"time": [round(s * SECOND) for s in second]}))
-    return runs_of_views(pl.DataFrame(
+    return runs_of_views(halves(pl.DataFrame(
         {
             "tracklet_id": list(tracklet), "object_id": list(object_), "epoch": time["time"],
             "used": list(used), "sensor_id": ["s"] * len(views),
             "frame_number": [7] * len(views), "centroid": [3] * len(views),
         },
         schema_overrides={"tracklet_id": pl.String, "object_id": pl.String, "used": pl.Boolean},
-    )).sort("first", "tracklet_id")  # fmt: skip
+    ))).sort("first", "tracklet_id")  # fmt: skip
+
+
+def halves(views: pl.DataFrame) -> list[pl.DataFrame]:
+    """The views in two pieces: a run may have epochs in both."""
+    return [views.gather_every(2), views.gather_every(2, 1)]
 
 
 def objects(seen: pl.DataFrame, of_runs: pl.DataFrame) -> dict[int, str]:

@@ -3,7 +3,7 @@
 import numpy as np
 import polars as pl
 import pytest
-from scenes.made_nights import hostile_night, reader_of
+from scenes.made_nights import filled, hostile_night, reader_of, seconds
 
 from epipole.io.datasets.dataset import night_reader
 from epipole.tasks.report import object_details
@@ -66,6 +66,14 @@ def test_the_frame_concerned_is_one_that_is_not_identified():
     assert (frame.sensor_id, frame.status) == ("s1", "s1")
     assert frame.frame_number >= 6
     assert len(frame.star_id) == 0
+
+
+def test_frames_of_sensors_that_are_equally_bad_are_in_the_order_of_their_names():
+    names = ["d", "b", "c", "a"] * 6
+    frames = filled("frames", sensor_id=names, time=seconds(24), frame_number=np.arange(24),
+                    attitude_source=["none"] * 24, status=["no_match"] * 24)  # fmt: skip
+    facts = read_night_facts(reader_of({"frames": frames}), "out")
+    assert list(facts.concerned) == ["a", "b", "c", "d"]
 
 
 def test_an_object_has_its_observations_and_its_orbit(facts):
