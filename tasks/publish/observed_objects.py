@@ -92,7 +92,7 @@ def runs_of_views(pieces: Iterable[pl.DataFrame]) -> pl.DataFrame:
     )
 
 
-_CODED = {
+_CODED: dict[str, pl.DataType | type[pl.DataType]] = {
     "tracklet_id": pl.UInt32, "object_id": pl.UInt32, "used": pl.Boolean,
     "epoch": pl.Datetime("ns", "UTC"),
 }  # fmt: skip
