@@ -20,12 +20,13 @@ from epipole.tasks.overlay.annotations import (
     image_of,
     png,
 )
-from epipole.tasks.overlay.scene import objects, transform
+from epipole.tasks.overlay.scene import objects, points, transform
 
 ANNOTATIONS, CALIBRATION, IMAGE = (
     "foxglove.ImageAnnotations", "foxglove.CameraCalibration", "foxglove.CompressedImage",
 )  # fmt: skip
 TRANSFORM, SCENE, LOG = "foxglove.FrameTransform", "foxglove.SceneUpdate", "foxglove.Log"
+CLOUD, POINTS = "foxglove.PointCloud", "/epipole/points"
 OBJECTS, TRANSFORMS, LEFT_OUT = "/epipole/objects", "/epipole/transforms", "/epipole/rejects"
 
 StarOrDetected = TypeVar("StarOrDetected", StarSpot, DetectedSpot)
@@ -95,7 +96,7 @@ def _image(
 
 
 def epoch_messages(tables: SpanTables, lifetime_ns: int) -> Iterator[ViewerMessage]:
-    """Yield the objects of each epoch, with the lines of sight to them."""
+    """Yield the objects of each epoch, with the lines of sight to them; and as points."""
     sensors = tables.frames.select("sensor_id", "frame_number", *POSITION)
     lines = tables.associations.join(sensors, on=["sensor_id", "frame_number"], how="inner")
     lines = (
@@ -112,6 +113,7 @@ def epoch_messages(tables: SpanTables, lifetime_ns: int) -> Iterator[ViewerMessa
         time_ns = positions["time_ns"][0]
         data = objects(time_ns, positions, seen_from.get(epoch, {}), lifetime_ns)
         yield ViewerMessage(time_ns, OBJECTS, SCENE, data)
+        yield ViewerMessage(time_ns, POINTS, CLOUD, points(time_ns, positions))
 
 
 def log_messages(rejects: pl.DataFrame) -> Iterator[ViewerMessage]:

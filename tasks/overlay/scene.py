@@ -12,6 +12,8 @@ import numpy as np
 import numpy.typing as npt
 import polars as pl
 from foxglove_schemas_protobuf.FrameTransform_pb2 import FrameTransform
+from foxglove_schemas_protobuf.PackedElementField_pb2 import PackedElementField
+from foxglove_schemas_protobuf.PointCloud_pb2 import PointCloud
 from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
 
 from epipole.schemas.columns import POSITION
@@ -83,6 +85,18 @@ def objects(
             _vector(sight.points.add(), sensor_km)
             _vector(sight.points.add(), position)
         _colour(sight.color, BLUE, 0.6)
+    data: bytes = message.SerializeToString(deterministic=True)
+    return data
+
+
+def points(time_ns: int, positions: pl.DataFrame) -> bytes:
+    """Return the objects of an epoch as points alone, for viewers that know no scenes."""
+    message: Any = PointCloud(frame_id=ROOT_FRAME, point_stride=12)
+    _time(message.timestamp, time_ns)
+    message.pose.orientation.w = 1.0
+    for number, name in enumerate("xyz"):
+        message.fields.add(name=name, offset=4 * number, type=PackedElementField.FLOAT32)
+    message.data = (positions.select(POSITION).to_numpy() * KM).astype("<f4").tobytes()
     data: bytes = message.SerializeToString(deterministic=True)
     return data
 

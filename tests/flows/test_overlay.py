@@ -195,6 +195,18 @@ def test_a_night_without_positions_still_has_its_stars(night_log, night_dataset,
     assert not any("HIP" in text.text for _, _, m in drawn for text in m.texts)
 
 
+def test_points_are_the_positions_of_each_epoch(written, night_dataset):
+    positions = table(night_dataset, "positions")
+    clouds = written[2]["foxglove.PointCloud"]
+    assert len(clouds) == positions["epoch"].n_unique()
+    for topic, time_ns, cloud in clouds[:3]:
+        assert (topic, cloud.frame_id, at(cloud.timestamp)) == ("/epipole/points", "GCRF", time_ns)
+        at_epoch = positions.filter(pl.col("epoch").dt.timestamp("ns") == time_ns)
+        told_m = np.frombuffer(cloud.data, "<f4").reshape(-1, 3)
+        km = at_epoch.select("x_km", "y_km", "z_km").to_numpy()
+        np.testing.assert_allclose(told_m, km * 1e3, atol=4.0)
+
+
 def test_the_layout_has_panels_of_topics_that_are_there(written):
     path, made, found = written
     layout = json.loads(Path(made.layout).read_text())
