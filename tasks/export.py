@@ -96,9 +96,12 @@ def sensor_ephemeris(frames: pl.DataFrame) -> Ephemeris:
 
 
 def in_frame(of: Ephemeris, frame: str) -> Ephemeris:
-    """Return an ephemeris in GCRF with its covariances in another of `MESSAGE_FRAMES`."""
+    """Return an ephemeris in GCRF with its covariances in another of `MESSAGE_FRAMES`.
+
+    All covariances are positive definite, as readers ask; see `positive`.
+    """
     if frame == of.frame:
-        return of
+        return of._replace(covariance=positive(of.covariance))
     table = read_earth_orientation()
     turn, covariance_turn = (
         from_gcrf(frame, time_ns, orientation_at(time_ns, *table))
@@ -106,7 +109,24 @@ def in_frame(of: Ephemeris, frame: str) -> Ephemeris:
     )
     state = np.einsum("nij,nj->ni", turn, of.state)
     covariance = covariance_turn @ of.covariance @ np.swapaxes(covariance_turn, 1, 2)
-    return Ephemeris(of.time_ns, state, of.covariance_ns, covariance, frame)
+    return Ephemeris(of.time_ns, state, of.covariance_ns, positive(covariance), frame)
+
+
+# Of a correlation matrix: a smaller eigenvalue is lost in the rounding of its elements.
+LEAST_EIGENVALUE = 1e-10
+
+
+def positive(covariance: np.ndarray) -> np.ndarray:
+    """Return covariances (n, 6, 6) that rounding does not make indefinite.
+
+    After a day, an orbit that a short arc hardly shows is known a million times better across than
+    along its motion. Its variances become larger by up to 1e-10 of themselves.
+    """
+    symmetric = (covariance + np.swapaxes(covariance, 1, 2)) / 2
+    sigma = np.sqrt(np.diagonal(symmetric, axis1=1, axis2=2))
+    least = np.linalg.eigvalsh(symmetric / (sigma[:, :, None] * sigma[:, None, :]))[:, 0]
+    more = np.clip(2 * LEAST_EIGENVALUE - least, 0.0, None) * (least < LEAST_EIGENVALUE)
+    return np.asarray(symmetric + (more[:, None] * sigma**2)[:, :, None] * np.eye(6))
 
 
 # The orbit of an object, moved through its arc under the forces that it was fitted with.

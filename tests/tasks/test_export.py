@@ -15,6 +15,7 @@ from epipole.tasks.export import (
     arcs,
     areas_in,
     orbit_arc,
+    positive,
     single_states,
     subjects,
 )
@@ -124,3 +125,16 @@ def test_only_known_names_are_given():
     )
     expected = {"o": Subject("o", 7, None, "SAT"), "t": Subject("t", 8, "2020-001A")}
     assert subjects(to_polars(named)) == expected
+
+
+def test_covariances_are_positive_definite_after_a_day_of_a_weak_orbit():
+    rng = np.random.default_rng(1)
+    sound = np.array([a @ a.T for a in rng.normal(size=(5, 6, 6))])
+    np.testing.assert_allclose(positive(sound), sound, rtol=1e-15)
+    sigma = np.array([4e3, 2e3, 6e3, 1.0, 2.0, 3.0])
+    weak = np.outer(sigma, sigma) * (1 - 1e-17)
+    weak += np.diag(rng.normal(size=6) * 1e-12 * sigma**2)  # rounding
+    (made,) = positive(weak[None])
+    least = np.linalg.eigvalsh(made / np.sqrt(np.outer(np.diag(made), np.diag(made))))[0]
+    assert least > 5e-11
+    np.testing.assert_allclose(np.diag(made), np.diag(weak), rtol=1e-9)
