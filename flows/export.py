@@ -24,7 +24,7 @@ from epipole.io.datasets.dataset import night_row, nights_in, read_table
 from epipole.io.paths import fault_of_name
 from epipole.schemas.bridge import to_polars
 from epipole.schemas.errors import DatasetError
-from epipole.schemas.options import Message, MessageForm, MessageFrame, star_ids
+from epipole.schemas.options import Message, MessageForm, MessageFrame, star_ids_of
 from epipole.tasks.export import (
     arcs,
     directions,
@@ -147,8 +147,7 @@ def _write_observations(night: _NightTables, wanted: Sequence[str], folder: Path
     objects, tracklets = _observed(night, wanted)
     found = [*objects.values(), *tracklets.values()]
     if found:
-        row = night_row(night.dataset, night.night)
-        ids = "" if row is None else star_ids(row["star_catalogue_key"].partition(" ")[0])
+        ids = star_ids_of(night_row(night.dataset, night.night))
         rows = pl.concat(found).sort("time", "sensor_id", "tracklet_id")
         text = observation_file(rows, night.subjects, catalogue_name(ids))
         write_message(folder / f"{night.night}.psv", text)

@@ -20,7 +20,7 @@ from epipole.io.logs.reader import read_log_pieces
 from epipole.io.logs.writer import ViewerFile
 from epipole.schemas.bridge import array, to_polars
 from epipole.schemas.errors import DatasetError, LogError, NoFramesError
-from epipole.schemas.options import star_ids
+from epipole.schemas.options import star_ids_of
 from epipole.schemas.spans import DAY_NS, SPAN_NS, Span, day_of
 from epipole.tasks.overlay.layout import viewer_layout
 from epipole.tasks.overlay.messages import (
@@ -54,7 +54,7 @@ class Overlay:
 
 
 class _Logs:
-    """What the logs have: calibrations, and the times of the frames of each sensor."""
+    """What the logs have: calibrations, sensors, and the times of the frames of each."""
 
     def __init__(self, paths: Sequence[str]) -> None:
         cameras, exposures = [], []
@@ -67,6 +67,7 @@ class _Logs:
         self.frames = frames.unique().sort("time", "sensor_id")
         if not len(self.frames):
             raise LogError(f"{', '.join(paths)}: no frames in these logs; give others")
+        self.sensors: list[str] = sorted(set(self.frames["sensor_id"]))
         self.nights = nights_of(self.frames["time"].dt.timestamp("ns").to_numpy())
 
 
@@ -101,7 +102,7 @@ def overlay(
                 for message in _of_night(dataset, date, given, images, counts):
                     file.message(message.topic, message.schema, message.time_ns, message.data)
         layout = out.with_suffix(".layout.json")
-        panels = viewer_layout(given.frames["sensor_id"].unique().sort().to_list())
+        panels = viewer_layout(given.sensors)
         layout.write_text(json.dumps(panels, indent=1) + "\n")
     except OSError as error:
         raise DatasetError(f"{out}: cannot be written: {error.strerror}; give another") from error
@@ -137,10 +138,9 @@ def _calibrations(file: ViewerFile, given: _Logs, night: str) -> None:
 def _of_night(
     dataset: str, night: str, given: _Logs, images: bool, counts: dict[str, int]
 ) -> Iterator[ViewerMessage]:
-    sensors = sorted(set(given.frames["sensor_id"]))
     times_ns = given.frames["time"].dt.timestamp("ns").to_numpy()
     row = night_row(dataset, night)
-    ids = "" if row is None else star_ids(row["star_catalogue_key"].partition(" ")[0])
+    ids = star_ids_of(row)
     shapes = camera_shapes(given.cameras) if images else {}
     positions = array(read_table(dataset, "positions", night, ["epoch"]), "epoch")
     apart_ns = np.diff(np.unique(positions))
@@ -153,7 +153,7 @@ def _of_night(
     for fault in row["faults"] if row is not None else ():
         yield log_message(start_ns, Log.Level.ERROR, "check", fault)
     for span in of_night:
-        tables = _tables(dataset, night, span, sensors)
+        tables = _tables(dataset, night, span, given.sensors)
         messages = [
             *frame_messages(tables, f"{ids} " if ids else "", shapes),
             *epoch_messages(tables, lifetime_ns),

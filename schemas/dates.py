@@ -23,6 +23,15 @@ def is_night(text: object) -> bool:
         return False
 
 
+def ends_of(nights: str) -> tuple[str, str]:
+    """Return the first and the last night of a range, as in ``2019-04-01/2019-04-30``, or of one.
+
+    The texts are not checked.
+    """
+    first, _, last = nights.partition("/")
+    return first, last or first
+
+
 def nights_from(first: str, last: str) -> list[str]:
     """Return the nights from the first to the last, in order; none if the last is before it."""
     begin, end = datetime.date.fromisoformat(first), datetime.date.fromisoformat(last)

@@ -60,6 +60,11 @@ def star_ids(name: str) -> str:
     return "" if source is None else source.ids
 
 
+def star_ids_of(night: Mapping[str, Any] | None) -> str:
+    """Return the same of a row of `nights`, whose key begins with the name; None: "" too."""
+    return "" if night is None else star_ids(night["star_catalogue_key"].partition(" ")[0])
+
+
 _STARS = "epipole.tasks.algorithms.star_identification"
 _LINKING = "epipole.tasks.algorithms.tracking.linking"
 _ASSOCIATION = "epipole.tasks.solve.associate_objects"

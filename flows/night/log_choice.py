@@ -11,7 +11,7 @@ from pydantic import Field
 
 from epipole.io.logs.listing import list_logs
 from epipole.io.logs.logged_times import read_log_times
-from epipole.schemas.dates import YESTERDAY, nights_before, nights_from
+from epipole.schemas.dates import YESTERDAY, ends_of, nights_before, nights_from
 from epipole.schemas.errors import EpipoleError, LogError, NoFramesError
 from epipole.schemas.rejects import Reason, reject_rows
 from epipole.schemas.spans import DAY_NS, SPAN_NS
@@ -201,7 +201,7 @@ def night_asked(night: str | None) -> str | None:
         due: datetime.datetime = flow_run.scheduled_start_time
         return nights_before(due.astimezone(datetime.UTC).date().isoformat(), 1)[0]
     try:
-        first, last = _range(night)
+        first, last = ends_of(night)
         nights = nights_from(first, last)
     except ValueError as error:
         raise EpipoleError(f"night {night}: no such date; give one such as 2019-04-01") from error
@@ -216,13 +216,7 @@ def nights_asked_before(night: str | None, asked: str | None, last_nights: int) 
         return []
     if night == YESTERDAY:
         return nights_before(asked, last_nights - 1)
-    return nights_from(_range(night)[0], asked)[:-1]
-
-
-def _range(night: str) -> tuple[str, str]:
-    """Return the first and the last night of a range, as in ``2019-04-01/2019-04-30``."""
-    first, _, last = night.partition("/")
-    return first, last or first
+    return nights_from(ends_of(night)[0], asked)[:-1]
 
 
 def run_name() -> str:

@@ -15,7 +15,7 @@ from prefect.client.schemas.filters import FlowRunFilter
 from prefect.exceptions import PrefectException
 from prefect.runtime import deployment, flow_run
 
-from epipole.schemas.dates import YESTERDAY, is_night, nights_before, nights_from
+from epipole.schemas.dates import YESTERDAY, ends_of, is_night, nights_before, nights_from
 
 LOGGER = logging.getLogger(__name__)
 
@@ -58,6 +58,5 @@ def _nights(asked: object, due: datetime.datetime | None) -> list[str]:
     """Return the nights that a run asks for; none if it asks for all that its logs have."""
     if asked == YESTERDAY and due is not None:
         return nights_before(due.astimezone(datetime.UTC).date().isoformat(), 1)
-    first, _, last = asked.partition("/") if isinstance(asked, str) else ("", "", "")
-    ends = first, last or first
+    ends = ends_of(asked) if isinstance(asked, str) else ("", "")
     return nights_from(*ends) if all(is_night(end) for end in ends) else []

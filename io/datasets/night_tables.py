@@ -44,10 +44,13 @@ class NightReader:
         """Return the night whose tables lie in this local folder."""
         return cls(str(folder), night, lambda table: sorted((folder / table).glob("*.parquet")))
 
-    def read(self, table: str, columns: Sequence[str]) -> pl.DataFrame:
-        """Return all rows of a table that is small, or of few columns."""
+    def read(
+        self, table: str, columns: Sequence[str], between_ns: tuple[int, int] | None = None
+    ) -> pl.DataFrame:
+        """Return the rows of a table, all or of some time (see `pieces`): few, or few columns."""
         with self._as_dataset_errors(table):
-            pieces = map(to_polars, within_bounds(self._pieces(table, columns), MAX_BYTES))
+            rows = within_bounds(self._pieces(table, columns, between_ns), MAX_BYTES)
+            pieces = map(to_polars, rows)
             return pl.concat([self.empty(table, columns), *pieces])
 
     def pieces(

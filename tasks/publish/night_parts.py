@@ -9,6 +9,7 @@ import numpy.typing as npt
 import pyarrow as pa
 
 from epipole.io.datasets.dataset import publish_folders
+from epipole.io.datasets.night_tables import ROWS_IN_GROUP
 from epipole.io.work.work_layout import SensorParts, SolvedParts
 from epipole.schemas.bridge import array
 from epipole.schemas.settings import TableSettings
@@ -53,7 +54,7 @@ def publish_nights(
 
 # Slices of time: rows of a span from many parts, merged in slices that fit in memory.
 
-MAX_ROWS = 1 << 17  # in a slice, about: a row group
+MAX_ROWS = ROWS_IN_GROUP  # in a slice, about
 MAX_SAMPLED = 1_000_000  # times of rows by which a span is divided
 ROWS_OF_TABLE = 200  # with many tables a slice has more rows: each table is opened for each slice
 

@@ -68,20 +68,16 @@ class _Pose(NamedTuple):
 
 
 def read_epipolar_views(
-    night: NightReader, calibrations: pl.DataFrame, sizes_px: dict[str, Array]
+    night: NightReader, epoch_ns: int, calibrations: pl.DataFrame, sizes_px: dict[str, Array]
 ) -> EpipolarViews | None:
-    """Return the epoch with the most views, and the two sensors that share the most objects.
+    """Return an epoch's views of the two sensors that share the most objects.
 
-    None: no epoch has an object that two sensors with calibrations saw.
+    None: it has no object that two sensors with calibrations saw.
     """
     cameras = _cameras(calibrations, sizes_px)
-    epoch_ns = best_epoch(night)
-    if epoch_ns is None:
-        return None
     columns = ["epoch", "object_id", "sensor_id", "frame_number", "x_px", "y_px", "epipolar_px",
                "used"]  # fmt: skip
-    pieces = night.pieces("associations", columns, (epoch_ns, epoch_ns + 1))
-    views = pl.concat([night.empty("associations", columns), *pieces])
+    views = night.read("associations", columns, (epoch_ns, epoch_ns + 1))
     views = views.filter(pl.col("used") & pl.col("sensor_id").is_in(list(cameras)))
     for first, second in _pairs(views):
         shared = first.join(second, on="object_id", suffix="_in").sort("object_id")

@@ -11,7 +11,6 @@ from epipole.schemas.columns import POSITION, VELOCITY
 from epipole.tasks.algorithms.constants import SECOND_NS
 from epipole.tasks.algorithms.geometry.directions import unit_from_radec
 from epipole.tasks.algorithms.orbits.orbit_fit import propagate
-from epipole.tasks.report.epipolar_views import best_epoch
 
 Array = npt.NDArray[np.float64]
 
@@ -49,12 +48,12 @@ class Globe(NamedTuple):
     n_sights: int
 
 
-def read_globe(night: NightReader) -> Globe | None:
-    """Return the globe at the epoch with the most views; None: no sensor has a position.
+def read_globe(night: NightReader, epoch_ns: int | None) -> Globe | None:
+    """Return the globe at an epoch; None: no sensor has a position.
 
-    Of a night without positions, at the middle of its orbits or else of its frames.
+    Without an epoch at the middle of the night's orbits, or else of its frames.
     """
-    time_ns = _time(night)
+    time_ns = _middle(night) if epoch_ns is None else epoch_ns
     if time_ns is None:
         return None
     near = _near(night, "frames", [*POSITION], time_ns, NEAR_NS, ["sensor_id"])
@@ -69,10 +68,7 @@ def read_globe(night: NightReader) -> Globe | None:
                  len(sensors), len(objects), len(sights))  # fmt: skip
 
 
-def _time(night: NightReader) -> int | None:
-    found = best_epoch(night)
-    if found is not None:
-        return found
+def _middle(night: NightReader) -> int | None:
     for table, column in (("orbits", "epoch"), ("frames", "time")):
         times = night.read(table, [column])[column].dt.epoch("ns").sort()
         if len(times):
@@ -85,8 +81,8 @@ def _near(
 ) -> pl.DataFrame:
     """Return the row of each key that is nearest to the time, in the order of the keys."""
     wanted = ["time", *key, *columns]
-    pieces = night.pieces(table, wanted, (time_ns - within_ns, time_ns + within_ns + 1))
-    rows = pl.concat([night.empty(table, wanted), *pieces]).drop_nulls(POSITION)
+    between = time_ns - within_ns, time_ns + within_ns + 1
+    rows = night.read(table, wanted, between).drop_nulls(POSITION)
     apart = (pl.col("time").dt.epoch("ns") - time_ns).abs()
     nearest = rows.sort(apart, maintain_order=True).unique(key, keep="first", maintain_order=True)
     return nearest.sort(key)
@@ -95,8 +91,7 @@ def _near(
 def _objects(night: NightReader, time_ns: int) -> dict[str, Array]:
     """Return where objects are: by their positions, else by their orbits."""
     columns = ["epoch", "object_id", *POSITION]
-    pieces = night.pieces("positions", columns, (time_ns, time_ns + 1))
-    rows = pl.concat([night.empty("positions", columns), *pieces]).sort("object_id")
+    rows = night.read("positions", columns, (time_ns, time_ns + 1)).sort("object_id")
     found = dict(zip(rows["object_id"], rows.select(POSITION).to_numpy(), strict=True))
     orbits = night.read("orbits", ["epoch", "object_id", *POSITION, *VELOCITY]).sort("object_id")
     ahead_s = (time_ns - orbits["epoch"].dt.epoch("ns").to_numpy()) / SECOND_NS

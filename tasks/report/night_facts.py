@@ -15,7 +15,12 @@ from epipole.io.datasets.night_tables import NightReader
 from epipole.schemas.log_checks import MISTAKE_COLUMNS, mistakes
 from epipole.schemas.rejects import NameStatus, ObjectVerdict, Reason, Trait
 from epipole.schemas.stages import Stage
-from epipole.tasks.report.epipolar_views import OPTICS, EpipolarViews, read_epipolar_views
+from epipole.tasks.report.epipolar_views import (
+    OPTICS,
+    EpipolarViews,
+    best_epoch,
+    read_epipolar_views,
+)
 from epipole.tasks.report.frame_series import FrameSeries, Gap, read_frame_series
 from epipole.tasks.report.globe import Globe, read_globe
 from epipole.tasks.report.object_details import MAX_DETAILED, ObjectDetail, read_object_details
@@ -139,11 +144,12 @@ def read_night_facts(
     series = read_frame_series(night)
     calibrations = night.read("calibrations", _CALIBRATIONS)
     residuals = views = None
+    epoch_ns = best_epoch(night)
     if series is not None:
         residuals = read_star_residuals(night, series.sensors, calibrations)
-    if residuals is not None:
+    if residuals is not None and epoch_ns is not None:
         sizes = dict(zip(residuals.sensors, residuals.size_px, strict=True))
-        views = read_epipolar_views(night, calibrations, sizes)
+        views = read_epipolar_views(night, epoch_ns, calibrations, sizes)
     objects = read_objects(night)
     return NightFacts(
         night=night.night,
@@ -159,7 +165,7 @@ def read_night_facts(
         star_catalogue=night.metadata("stars", "catalogue"),
         star_map=None if series is None else read_star_map(night, series),
         tracks=read_sky_tracks(night),
-        globe=read_globe(night),
+        globe=read_globe(night, epoch_ns),
         epipolar=views,
         concerned=_concerned(night, series, residuals),
         details=read_object_details(night, [each.object_id for each in look_first(objects)]),

@@ -48,7 +48,8 @@ class Picture {
     this.scale = 1;
     this.shift = [0, 0];
     this.chosen = -1;
-    if (svg.dataset.box) this.addButtons();
+    this.zooms = Boolean(svg.dataset.box || svg.dataset.turn);
+    if (this.zooms) this.addButtons();
     svg.addEventListener("pointermove", event => this.point(event));
     svg.addEventListener("pointerdown", event => this.press(event));
     for (const end of ["pointerup", "pointercancel"])
@@ -184,23 +185,26 @@ class Picture {
   }
 
   drag(event, at) {
-    if (!this.box) return;
+    if (!this.zooms) return;
     const before = this.pressed.get(event.pointerId);
     const others = [...this.pressed].filter(([id]) => id !== event.pointerId);
     if (others.length) {
       const other = others[0][1];
       const apart = point => Math.hypot(point[0] - other[0], point[1] - other[1]);
       this.zoom(apart(at) / Math.max(apart(before), 1), other);
-    } else if (this.scale > 1) {
-      this.shift = this.shift.map((value, k) => value + at[k] - before[k]);
-      this.draw();
-    }
+    } else this.slide(before, at);
     this.pressed.set(event.pointerId, at);
+  }
+
+  slide(before, at) {
+    if (this.scale === 1) return;
+    this.shift = this.shift.map((value, k) => value + at[k] - before[k]);
+    this.draw();
   }
 
   wheel(event) {
     // A page scrolls past a picture: only one that has the focus, or with Ctrl, zooms.
-    if (!this.svg.dataset.box || !(event.ctrlKey || document.activeElement === this.svg)) return;
+    if (!this.zooms || !(event.ctrlKey || document.activeElement === this.svg)) return;
     event.preventDefault();
     this.prepare();
     this.zoom(Math.exp(-event.deltaY / 300), this.at(event));
@@ -305,7 +309,6 @@ class Globe extends Picture {
     super(svg);
     this.first = numbers(svg.dataset.turn);
     this.turn = [...this.first];
-    this.addButtons();
   }
 
   prepare() {
@@ -333,29 +336,14 @@ class Globe extends Picture {
     this.svg.setPointerCapture(event.pointerId);
   }
 
-  drag(event, at) {
-    const before = this.pressed.get(event.pointerId);
-    const others = [...this.pressed].filter(([id]) => id !== event.pointerId);
-    if (others.length) {
-      const apart = point => Math.hypot(point[0] - others[0][1][0], point[1] - others[0][1][1]);
-      this.zoom(apart(at) / Math.max(apart(before), 1));
-    } else {
-      const angle = 90 / this.view.width / Math.sqrt(this.scale);
-      this.turned(angle * (before[0] - at[0]), angle * (at[1] - before[1]));
-    }
-    this.pressed.set(event.pointerId, at);
+  slide(before, at) {
+    const angle = 90 / this.view.width / Math.sqrt(this.scale);
+    this.turned(angle * (before[0] - at[0]), angle * (at[1] - before[1]));
   }
 
   turned(east, north) {
     this.turn = [this.turn[0] + east, Math.max(-90, Math.min(90, this.turn[1] + north))];
     this.draw();
-  }
-
-  wheel(event) {
-    if (!(event.ctrlKey || document.activeElement === this.svg)) return;
-    event.preventDefault();
-    this.prepare();
-    this.zoom(Math.exp(-event.deltaY / 300));
   }
 
   key(event) {

@@ -10,6 +10,7 @@ from scenes.made_nights import START_NS, filled, reader_of
 from epipole.io.datasets.dataset import night_reader
 from epipole.tasks.algorithms.constants import EARTH_RADIUS_KM, GM_KM3_S2, SECOND_NS
 from epipole.tasks.report import globe as globe_module
+from epipole.tasks.report.epipolar_views import best_epoch
 from epipole.tasks.report.globe import SIGHT_KM, Globe, Sight, read_globe
 
 pytest.importorskip("matplotlib")
@@ -24,7 +25,8 @@ def at_seconds(*times_s):
 
 @pytest.fixture(scope="module")
 def globe(night_dataset):
-    return read_globe(night_reader(night_dataset, NIGHT))
+    night = night_reader(night_dataset, NIGHT)
+    return read_globe(night, best_epoch(night))
 
 
 def test_the_example_has_all_its_sensors_objects_and_lines_of_sight(globe):
@@ -55,7 +57,7 @@ def test_of_a_night_without_positions_the_orbits_are_moved_to_the_time():
             dec_deg=[0.0, 0.0], **at,
         ),
     }  # fmt: skip
-    found = read_globe(reader_of(tables))
+    found = read_globe(reader_of(tables), None)
     assert sorted(found.objects) == ["a", "b"]  # the orbit of the third is hours away
     np.testing.assert_allclose(found.objects["b"], [r_km, 0, 0])
     angle = 600.0 * speed / r_km
@@ -68,10 +70,10 @@ def test_of_a_night_without_positions_the_orbits_are_moved_to_the_time():
 
 
 def test_without_frames_or_places_of_sensors_there_is_none():
-    assert read_globe(reader_of({})) is None
+    assert read_globe(reader_of({}), None) is None
     frames = filled("frames", sensor_id=["s"], time=at_seconds(1), x_km=[None], y_km=[None],
                     z_km=[None])  # fmt: skip
-    assert read_globe(reader_of({"frames": frames})) is None
+    assert read_globe(reader_of({"frames": frames}), None) is None
 
 
 def test_what_is_behind_the_earth_is_hidden_and_the_rest_is_in_its_place():
@@ -98,5 +100,5 @@ def test_of_thousands_some_are_drawn_and_all_are_counted(monkeypatch):
     names = [f"s{k}" for k in range(5)]
     at = {name: [7000.0] * 5 for name in ("x_km", "y_km", "z_km")}
     frames = filled("frames", sensor_id=names, time=at_seconds(1, 1, 1, 1, 1), **at)
-    found = read_globe(reader_of({"frames": frames}))
+    found = read_globe(reader_of({"frames": frames}), None)
     assert (found.n_sensors, list(found.sensors)) == (5, names[:3])
