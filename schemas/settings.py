@@ -403,7 +403,7 @@ class LinkingSettings(Group):
 
     enabled: bool = Field(True, description="Whether tracklets are joined by orbits.")
     max_gap_s: float = Field(
-        900.0,
+        2400.0,
         gt=0,
         le=2400,
         description="Longest time between two tracklets that are compared. Less than half a low "
@@ -413,15 +413,15 @@ class LinkingSettings(Group):
         10800.0,
         ge=0,
         le=43200,
-        description="Longest time between two objects of several tracklets each that are compared, "
-        "by their orbits. 0: none are.",
+        description="Longest time between an object of several tracklets and another, or a single "
+        "tracklet, that are compared by its orbit. 0: none are.",
     )
     log_odds: float = Field(
-        9.0,
+        7.0,
         gt=0,
         le=MAX_LOG_ODDS,
-        description="Least log-odds (ln) that tracklets are one object. At the default, 1 in "
-        "10,000 links is wrong.",
+        description="Least log-odds (ln) that tracklets are one object; of two alone that are less "
+        "than two minutes apart, 2 more. At the default, less than 1 in 10,000 links is wrong.",
     )
 
 

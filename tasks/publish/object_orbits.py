@@ -28,6 +28,7 @@ from epipole.tasks.algorithms.orbits.orbit_determination import (
     ObjectDirections,
     determine_orbit,
     log_evidence,
+    neglected,
 )
 from epipole.tasks.common.grouping import factorize, group_offsets
 from epipole.tasks.publish.sensor_errors import SensorSums, summed_equations
@@ -221,7 +222,18 @@ def _from_state(
             area = orbit.unknowns[6 if force == RADIATION else 7]
             forces = f"{GRAVITY} {force} {area:.4f} m2/kg" if force else GRAVITY
             found.append((log_evidence(orbit, areas), FittedOrbit(orbit, epoch_s, forces)))
-    return max(found, key=lambda each: each[0])[1] if found else None
+    return (
+        _with_neglected(max(found, key=lambda each: each[0])[1], last_s - first_s)
+        if found
+        else None
+    )
+
+
+def _with_neglected(fitted: FittedOrbit, arc_s: float) -> FittedOrbit:
+    """Return an orbit whose covariance has what its forces neglect."""
+    cov = fitted.orbit.cov.copy()
+    cov[:6, :6] += neglected(fitted.orbit.unknowns[:3], arc_s)
+    return fitted._replace(orbit=fitted.orbit._replace(cov=cov))
 
 
 def _possible_forces(state: Array, arc_s: float) -> list[tuple[str, AreaPrior]]:

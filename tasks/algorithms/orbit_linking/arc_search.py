@@ -2,7 +2,8 @@
 
 Orbits of earlier objects are propagated from block to block of time. In each block the orbits that
 begin there are compared with them, by a tree over position and velocity: linear in the number of
-objects, where not all of them are near each other.
+objects, where not all of them are near each other (`near_orbits`). Single tracklets are compared
+with the direction and the rates that each orbit has at their time (`near_tracklets`).
 """
 
 from typing import NamedTuple
@@ -13,7 +14,7 @@ from scipy.spatial import cKDTree
 
 from epipole.tasks.algorithms.earth_gravity import advance
 from epipole.tasks.algorithms.kernels import kernel
-from epipole.tasks.algorithms.orbit_linking.arc_fit import STEP_S
+from epipole.tasks.algorithms.orbit_linking.arc_fit import MIN_COSINE, STEP_S, Tracklets
 
 Array = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int64]
@@ -22,6 +23,11 @@ BLOCK_S = 600.0  # length of a block: the orbits that begin in it are propagated
 # Farther apart [km, km/s] two orbits are not compared. Estimated: the orbit of two tracklets a
 # minute apart is off by a part of this an hour later, and neighbours in a plane are farther apart.
 NEAR_KM, NEAR_KM_S = 300.0, 0.3
+MIN_ROOM = 4096  # for pairs at first; if there are more, the search is repeated with more
+MAX_SINGLE = (
+    5000  # single tracklets that each end is compared with: bounds the time of a dense night
+)
+NEAR_SIGMA = 5.0  # and of the error of a tracklet's rates
 
 
 class ArcEnds(NamedTuple):
@@ -39,6 +45,18 @@ class ArcEnds(NamedTuple):
     time_s: Array
     epoch_s: Array
     state: Array
+
+
+def no_ends(count: int) -> ArcEnds:
+    return ArcEnds(
+        np.full(count, -1), np.zeros(count), np.zeros(count), np.full((count, 6), np.nan)
+    )
+
+
+def sound_ends(ends: ArcEnds) -> ArcEnds:
+    """Return the ends with an orbit."""
+    kept = np.isfinite(ends.state).all(axis=1)
+    return ArcEnds(ends.row[kept], ends.time_s[kept], ends.epoch_s[kept], ends.state[kept])
 
 
 @kernel
@@ -83,3 +101,84 @@ def near_orbits(tails: ArcEnds, heads: ArcEnds, max_gap_s: float) -> Indices:
     gap = heads.time_s[later] - tails.time_s[earlier]
     kept = (gap > 0.0) & (gap <= max_gap_s)
     return np.stack([earlier[kept], later[kept]], axis=1)
+
+
+@kernel
+def _near(y, tracklets, k):
+    """Return whether an orbit y (6,) at a tracklet's time is near its line of sight and motion."""
+    rho2, seen = 0.0, 0.0
+    for m in range(3):
+        d = y[m] - tracklets.r_km[k, m]
+        rho2 += d * d
+        seen += d * tracklets.u[k, m]
+    rho = np.sqrt(rho2)
+    if seen < MIN_COSINE * rho:
+        return False
+    across2, faster2 = 0.0, 0.0
+    for c in range(2):
+        axis = tracklets.east[k] if c == 0 else tracklets.north[k]
+        off, faster = 0.0, 0.0
+        for m in range(3):
+            off += axis[m] * (y[m] - tracklets.r_km[k, m])
+            faster += axis[m] * (y[3 + m] - tracklets.v_km_s[k, m] - rho * tracklets.w[k, m])
+        across2 += off * off
+        faster2 += faster * faster
+    sigma2 = rho2 * (tracklets.cov[k, 2, 2] + tracklets.cov[k, 3, 3])
+    return across2 < NEAR_KM**2 and faster2 < NEAR_KM_S**2 + NEAR_SIGMA**2 * sigma2
+
+
+@kernel
+def near_tracklets(ends, tracklets, free, way, min_gap_s, max_gap_s, out):
+    """Find single tracklets that are near the orbit of an arc, before or after it.
+
+    Parameters
+    ----------
+    ends : ArcEnds
+        Last ends, or the first ones.
+    free : (f,) int
+        The single tracklets, in order of time.
+    way : int
+        1: tracklets after the ends; -1: before them.
+    min_gap_s, max_gap_s : float
+        Shortest and longest time between a tracklet and the end [s]; less than the longest where
+        more than `MAX_SINGLE` tracklets are between.
+    out : (m, 2) int, out
+        The ends, and the rows of the tracklets.
+
+    Returns
+    -------
+    int
+        Number of pairs. It may be larger than m: then the rest is not written.
+    """
+    y, work, count, total = np.empty(6), np.empty((5, 42)), 0, len(free)
+    for n in range(len(ends.row)):
+        for m in range(6):
+            y[m] = ends.state[n, m]
+        now, compared = ends.epoch_s[n], 0
+        for at in range(total):
+            k = free[at] if way > 0 else free[total - 1 - at]
+            gap = way * (tracklets.time_s[k] - ends.time_s[n])
+            if gap < min_gap_s:
+                continue
+            if gap > max_gap_s or compared == MAX_SINGLE:
+                break
+            compared += 1
+            advance(y, tracklets.time_s[k] - now, STEP_S, work)
+            now = tracklets.time_s[k]
+            if _near(y, tracklets, k):
+                if count < len(out):
+                    out[count, 0], out[count, 1] = n, k
+                count += 1
+    return count
+
+
+def all_near_tracklets(
+    ends: ArcEnds, tracklets: Tracklets, free: Indices, way: int, min_gap_s: float, max_gap_s: float
+) -> Indices:
+    """Return all pairs of `near_tracklets`."""
+    room = MIN_ROOM
+    while True:
+        out = np.empty((room, 2), np.int64)
+        room = near_tracklets(ends, tracklets, free, way, min_gap_s, max_gap_s, out)
+        if room <= len(out):
+            return out[:room]

@@ -8,6 +8,8 @@ searches the ranges). So four small least-squares solutions replace the search: 
 the coefficients of a circular orbit at the sensor's height.
 """
 
+from collections.abc import Callable
+
 import numpy as np
 import numpy.typing as npt
 
@@ -38,6 +40,7 @@ J2_SHARE = 0.1  # part of the effect of the oblateness that its mean value lacks
 FIRST_GATE = 40.0  # chi-square of 2 degrees of freedom, of the first solution
 GATE = 30.0  # and of the last: 3e-7 of true pairs are beyond it
 MAX_RANGE_KM = 100_000.0  # as `association.max_range_km`
+MIN_PAIRS = 4096  # room for pairs at first; if there are more, the search is repeated with more
 MAX_LATER = 3000  # tracklets that each is compared with: bounds the time of a dense night
 
 
@@ -288,15 +291,15 @@ def _dot_at(a, m, b, n):
 
 
 @borrowing_kernel
-def _first_chi2(p, q, dt, f, g):
-    """Return chi-square of the first solution of `join_pair`, of two rows of `packed_tracklets`.
+def first_ranges(p, q, f, g, model_km):
+    """Return the ranges [km] of the first solution of two rows of `packed_tracklets`, chi-square.
 
     The equations are those of `_ranges`, without oblateness. All pairs are tested, so both axes
-    share one weight: that of their mean variance. inf where a range is not positive.
+    share one weight: that of their mean variance. model_km: 1-sigma error of Lagrange's f and g.
     """
-    fall = GRAVITY_SHARE * 0.5 * GM_KM3_S2 / _dot_at(p, _R, p, _R) * dt * dt
     square = FIRST_RANGE_KM * FIRST_RANGE_KM
-    common = p[_POSITION_VAR] + q[_POSITION_VAR] + fall * fall + square * (p[_VAR] + q[_VAR])
+    common = p[_POSITION_VAR] + q[_POSITION_VAR] + model_km * model_km
+    common += square * (p[_VAR] + q[_VAR])
     of_p = 1.0 / (common + g * g * square * p[_RATE_VAR])
     of_q = 1.0 / (common + g * g * square * q[_RATE_VAR])
     sums = NO_EQUATIONS
@@ -306,7 +309,14 @@ def _first_chi2(p, q, dt, f, g):
         sums = _with_equation(sums, of_p, -g * p[_OF_W + c], _dot_at(p, axis, q, _U), right)
         right = g * q[_OF_V + c] - f * q[_OF_R + c] + _dot_at(q, axis, p, _R)
         sums = _with_equation(sums, of_q, -_dot_at(q, axis, p, _U), -g * q[_OF_W + c], right)
-    a, b, chi2 = _solved_ranges(sums)
+    return _solved_ranges(sums)
+
+
+@borrowing_kernel
+def _first_chi2(p, q, dt, f, g):
+    """Return chi-square of the first solution of `join_pair`; inf where a range is not positive."""
+    fall = GRAVITY_SHARE * 0.5 * GM_KM3_S2 / _dot_at(p, _R, p, _R) * dt * dt
+    a, b, chi2 = first_ranges(p, q, f, g, fall)
     return chi2 if a > 0.0 and b > 0.0 else np.inf
 
 
@@ -386,3 +396,24 @@ def _start_km(p, rho):
     """Return the distance from the geocentre of a point on a line of sight, above the ground."""
     r2 = _dot_at(p, _R, p, _R) + 2.0 * rho * _dot_at(p, _R, p, _U) + rho * rho
     return max(np.sqrt(r2), EARTH_RADIUS_KM + MIN_HEIGHT_KM)
+
+
+def near_pairs(
+    tracklets: Tracklets, packed: Array, group: Indices, max_gap_s: float
+) -> tuple[Indices, Array]:
+    """Return all pairs (p, 2) of `search`, and their orbits (p, 6)."""
+    n, state, work = len(group), np.empty(6), np.empty((8, 3))
+    return with_room(
+        n, lambda *out: search(tracklets, packed, group, max_gap_s, 0, n, *out, state, work)
+    )
+
+
+def with_room(n: int, find: Callable[[Indices, Array], int]) -> tuple[Indices, Array]:
+    """Return the pairs and orbits that a search of n tracklets writes to its arguments."""
+    room = MIN_PAIRS + 8 * n
+    while True:
+        pairs, states = np.empty((room, 2), np.int64), np.empty((room, 6))
+        count = find(pairs, states)
+        if count <= room:
+            return pairs[:count], states[:count]
+        room = count

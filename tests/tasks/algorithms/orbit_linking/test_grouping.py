@@ -1,11 +1,13 @@
 """Grouping: the tracklets of an object become one, and those of others do not join it."""
 
 import numpy as np
+import pytest
 from scenes.orbit_tracklets import orbit_tracklets
 
 from epipole.tasks.algorithms.orbit_linking import grouping
 from epipole.tasks.algorithms.orbit_linking.arc_fit import Tracklets
 from epipole.tasks.algorithms.orbit_linking.grouping import link_tracklets
+from epipole.tasks.algorithms.orbit_linking.population import log_attributable_density
 from epipole.tasks.algorithms.orbits.orbit_fit import propagate
 
 NONE = -1
@@ -41,11 +43,24 @@ def test_rough_tracklets_stay_alone_rather_than_join_others():
 
 def test_tracklets_that_say_little_in_pairs_are_joined_by_four(monkeypatch):
     scene = orbit_tracklets(9, 60, 4, 60.0, rate_arcsec_s=12.0)
-    label = linked(scene, log_odds=9.0)
+    label = linked(scene)
     assert wrong(label, scene.object) == 0
     assert len(np.unique(label)) == 60
     monkeypatch.setattr(grouping, "LOOSE_LOG_ODDS", 99.0)
-    assert len(np.unique(linked(scene, log_odds=9.0))) >= 65
+    assert len(np.unique(linked(scene))) >= 65
+
+
+def test_two_tracklets_that_are_near_in_time_need_more_evidence():
+    scene = orbit_tracklets(14, 150, 2, 60.0, direction_arcsec=8.0, rate_arcsec_s=12.0)
+    label = linked(scene)
+    assert wrong(label, scene.object) == 0
+    seen, known = scene.tracklets, np.full(300, NONE)
+    alone = log_attributable_density(seen.r_km, seen.v_km_s, seen.u, seen.w)
+    edges = grouping._edges(seen, known, alone, 900.0)
+    joined = label[edges.pair[:, 0]] == label[edges.pair[:, 1]]
+    assert joined.sum() > 20
+    assert edges.odds[joined].min() > 9.0 - 0.1
+    assert (edges.odds[~joined] > 7.0).sum() > 5
 
 
 def test_loosely_joined_pairs_are_released():
@@ -105,6 +120,33 @@ def test_an_object_is_found_again_after_hours():
     assert len(np.unique(joined)) <= 42
     shorter = link_tracklets(scene.tracklets, known, **given, max_orbit_gap_s=3600.0).label
     np.testing.assert_array_equal(shorter, apart)
+
+
+def test_pairs_half_an_hour_apart_are_joined():
+    scene = orbit_tracklets(12, 60, 2, 2000.0, rate_arcsec_s=0.3)
+    known = np.full(len(scene.object), NONE)
+    near, far = (
+        link_tracklets(scene.tracklets, known, max_gap_s=gap_s, log_odds=7.0).label
+        for gap_s in (300.0, 2400.0)
+    )
+    assert wrong(far, scene.object) == 0
+    assert len(np.unique(far)) < 85 < 110 < len(np.unique(near))
+
+
+@pytest.mark.parametrize("first", [True, False])
+def test_a_single_tracklet_joins_an_orbit_hours_away(first):
+    scene = orbit_tracklets(13, 40, 4, 200.0, rate_arcsec_s=0.3, pause_s=6000.0)
+    order = np.argsort(scene.object, kind="stable").reshape(40, 4)
+    kept = np.sort(order[:, [0, 2, 3] if first else [0, 1, 2]].ravel())
+    seen = Tracklets(*(column[kept] for column in scene.tracklets))
+    number, known = scene.object[kept], np.full(len(kept), NONE)
+    given = {"max_gap_s": 900.0, "log_odds": 7.0}
+    apart = link_tracklets(seen, known, **given).label
+    joined = link_tracklets(seen, known, **given, max_orbit_gap_s=10_800.0).label
+    assert wrong(joined, number) == 0
+    whole = [len(np.unique(joined[number == k])) == 1 for k in range(40)]
+    assert sum(whole) >= 30
+    assert not any(len(np.unique(apart[number == k])) == 1 for k in range(40))
 
 
 def test_no_tracklets_no_groups():
