@@ -25,6 +25,7 @@ from epipole.io.paths import fault_of_name
 from epipole.schemas.bridge import to_polars
 from epipole.schemas.errors import DatasetError
 from epipole.schemas.options import Message, MessageForm, MessageFrame, star_ids_of
+from epipole.tasks.common.orbit_forces import noon_ns, surroundings_of
 from epipole.tasks.export import (
     arcs,
     directions,
@@ -35,7 +36,6 @@ from epipole.tasks.export import (
     single_states,
     subjects,
 )
-from epipole.tasks.publish.object_orbits import noon_ns, surroundings_of
 
 HOUR_NS = 3_600_000_000_000
 

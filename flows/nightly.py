@@ -255,8 +255,8 @@ def stage_night(
     whole = {**whole, **made.tables, "rejects": rejects}
     linked = write_night(made.work, made.solved, date, names, whole, staged, settings)
     misfits = determine_orbits(staged, date, linked)
-    states = earlier.last_states(date, settings)
-    residuals = name_known(staged, elements, states, settings)
+    before = earlier.last_objects(date, settings)
+    residuals = name_known(staged, elements, before, settings)
     list_objects(staged, date, misfits)
     faults = [verdict for verdict in made.work.verdicts if verdict.is_faulty]
     write_night_row(staged, recipe, earlier_key, faults, residuals)

@@ -1,6 +1,5 @@
 """Tables of a night for CCSDS messages: directions by sensor, states and ephemerides in a frame."""
 
-import re
 from collections.abc import Mapping
 from typing import Any
 
@@ -22,7 +21,7 @@ from epipole.tasks.algorithms.orbits.reference_frames import (
     orientation_at,
 )
 from epipole.tasks.algorithms.orbits.trajectories import propagate_unknowns
-from epipole.tasks.publish.object_orbits import DRAG, RADIATION
+from epipole.tasks.common.orbit_forces import areas_in
 
 # What is known of names.
 
@@ -133,13 +132,6 @@ def positive(covariance: np.ndarray) -> np.ndarray:
 
 STEPS = 60  # of an arc, at least
 MAX_STEP_S = 120.0  # between the states of an ephemeris: an interpolation is right to a millimetre
-_AREA = re.compile(r"(radiation|drag) (\S+) m2/kg")
-
-
-def areas_in(forces: str) -> list[float]:
-    """Return the areas over mass in sunlight and in the air that `orbits.forces` names [m^2/kg]."""
-    named = dict(_AREA.findall(forces))
-    return [float(named.get(force, 0.0)) for force in (RADIATION, DRAG)]
 
 
 def single_orbit(orbit: Mapping[str, Any]) -> Ephemeris:

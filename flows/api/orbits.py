@@ -19,6 +19,7 @@ from epipole.tasks.algorithms.geometry.directions import (
 from epipole.tasks.algorithms.orbit_linking.grouping import link_tracklets
 from epipole.tasks.algorithms.orbits.orbital_elements import IN_DEGREES, elements_of
 from epipole.tasks.algorithms.tracking.attributables import attributables
+from epipole.tasks.common.orbit_forces import noon_ns, surroundings_of
 from epipole.tasks.common.tracklet_arrays import (
     HAS_ATTRIBUTABLE,
     attributables_of,
@@ -30,9 +31,7 @@ from epipole.tasks.publish.object_orbits import (
     best_orbit,
     both,
     judge,
-    noon_ns,
     observed_objects,
-    surroundings_of,
 )
 
 NS = "datetime64[ns]"

@@ -34,14 +34,23 @@ from epipole.io.datasets.night_tables import read_columns, write_table
 from epipole.io.datasets.table_pieces import MAX_BYTES, within_bounds
 from epipole.io.logs.logged_times import open_mcap, read_digest
 from epipole.io.work.recipe import Recipe, digest_of, logs_key, recipe_of
-from epipole.schemas.bridge import array, concat, from_polars, rows_with, table, to_polars
+from epipole.schemas.bridge import (
+    array,
+    concat,
+    from_polars,
+    rows_with,
+    table,
+    table_name,
+    to_polars,
+)
 from epipole.schemas.dates import MONTH, nights_before
 from epipole.schemas.errors import DatasetError, LogError
 from epipole.schemas.rejects import Reason
 from epipole.schemas.settings import Settings
 from epipole.schemas.spans import DAY_NS, SPAN_NS, day_of
-from epipole.schemas.tables import NIGHTS, STATES
+from epipole.schemas.tables import NIGHTS, ORBITS, STATES
 from epipole.schemas.work_tables import OBJECT_DETECTIONS, LogSource
+from epipole.tasks.name.earlier_objects import EarlierObjects
 
 # The table `nights`: what a night was made from, with which settings, and what it has.
 
@@ -115,18 +124,21 @@ class EarlierNights:
         found = self._read(before, lambda where: _views(where, before, between_ns))
         return found or OBJECT_DETECTIONS.empty_table()
 
-    def last_states(self, night: str, settings: Settings) -> pa.Table:
-        """Return the last STATES of each object before a night.
+    def last_objects(self, night: str, settings: Settings) -> EarlierObjects:
+        """Return the last states and orbits of each object before a night.
 
         As far back as objects are recognised.
         """
         start_ns = day_of(night) * DAY_NS
         between_ns = (start_ns - round(settings.known_objects.earlier_h * HOUR_NS), start_ns)
 
-        def states(date: str) -> pa.Table | None:
-            return self._read(date, lambda where: _states(where, date, between_ns))
+        def rows(schema: pa.Schema) -> pa.Table:
+            def of_night(date: str) -> pa.Table | None:
+                return self._read(date, lambda where: _last(schema, where, date, between_ns))
 
-        return concat(STATES, filter(None, map(states, self._dates(night, settings))))
+            return concat(schema, filter(None, map(of_night, self._dates(night, settings))))
+
+        return EarlierObjects(rows(STATES), rows(ORBITS))
 
     def _dates(self, night: str, settings: Settings) -> list[str]:
         """Return the nights before a night that it depends on, at least that of the day before."""
@@ -179,16 +191,18 @@ def _views(where: str, night: str, between_ns: tuple[int, int]) -> pa.Table:
     return _kept(OBJECT_DETECTIONS, map(used, pieces), f"{where}/night={night}/associations")
 
 
-def _states(where: str, night: str, between_ns: tuple[int, int]) -> pa.Table:
+def _last(schema: pa.Schema, where: str, night: str, between_ns: tuple[int, int]) -> pa.Table:
+    """Return the last row of each object: of STATES or ORBITS."""
+    name = table_name(schema)
     numbers = [column.name for column in STATES if column.type == pa.float64()]
 
     def last(rows: pa.Table) -> pa.Table:
         finite = to_polars(rows).filter(pl.all_horizontal(pl.col(numbers).is_finite()))
         ordered = finite.sort("epoch", maintain_order=True)
-        return from_polars(STATES, ordered.unique("object_id", keep="last", maintain_order=True))
+        return from_polars(schema, ordered.unique("object_id", keep="last", maintain_order=True))
 
-    pieces = table_pieces(where, "states", night, STATES.names, between_ns)
-    return _kept(STATES, map(last, pieces), f"{where}/night={night}/states")
+    pieces = table_pieces(where, name, night, schema.names, between_ns)
+    return _kept(schema, map(last, pieces), f"{where}/night={night}/{name}")
 
 
 def _kept(schema: pa.Schema, pieces: Iterable[pa.Table], where: str) -> pa.Table:

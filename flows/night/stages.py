@@ -37,6 +37,7 @@ from epipole.tasks.check.check_sensors import (
 from epipole.tasks.check.correct_clock import correct_clock
 from epipole.tasks.common.batches import FRAMES_OF_TASK, in_batches
 from epipole.tasks.identify.identify_span import Counts, SpanToIdentify, identify_spans
+from epipole.tasks.name.earlier_objects import EarlierObjects
 from epipole.tasks.name.elements_of_night import ElementsOfNight, elements_of_night
 from epipole.tasks.name.judge_times import judge_times
 from epipole.tasks.name.known_objects import name_known_objects
@@ -384,7 +385,7 @@ def choose_elements(
 def name_known(
     folder: Path,
     known: ElementsOfNight | None,
-    earlier: pa.Table,
+    earlier: EarlierObjects,
     settings: Settings,
 ) -> list[SensorResidual]:
     """Name the known objects of a night whose tables are written; see `name_known_objects`.

@@ -13,11 +13,21 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from epipole.io.datasets.night_tables import read_columns, take_rows, write_table
-from epipole.schemas.bridge import array, concat, stack, stack_covariance, table
-from epipole.schemas.columns import POSITION, STATE_AXES, VELOCITY
+from epipole.schemas.bridge import (
+    array,
+    concat,
+    from_polars,
+    rows_with,
+    stack,
+    stack_covariance,
+    table,
+    to_polars,
+)
+from epipole.schemas.columns import POSITION
+from epipole.schemas.rejects import NameStatus
 from epipole.schemas.settings import KnownObjectSettings
 from epipole.schemas.stages import Stage
-from epipole.schemas.tables import IDENTIFICATIONS, STATES
+from epipole.schemas.tables import IDENTIFICATIONS
 from epipole.tasks.algorithms.known_objects.matching import (
     KnownSatellites,
     NameVerdict,
@@ -33,71 +43,11 @@ from epipole.tasks.algorithms.known_objects.prediction import (
     Screen,
     satellites_of,
 )
-from epipole.tasks.algorithms.orbits.object_linking import ObservedMotions, link_by_motion
 from epipole.tasks.common.stage_tasks import stage_task
+from epipole.tasks.name.earlier_objects import EarlierObjects, recognise_objects
 from epipole.tasks.name.elements_of_night import CatalogueNames, ElementsOfNight, names_of
 from epipole.tasks.name.known_tracklets import name_tracklets, tracklet_rows
 from epipole.tasks.name.sensor_residuals import SensorResidual, sensor_residuals
-
-# Objects of earlier nights, recognised by their motion.
-
-HOUR_S = 3600.0
-
-
-def recognise_objects(
-    folder: Path, objects: Sequence[str], earlier: pa.Table, earlier_h: float, log_odds: float
-) -> dict[str, str]:
-    """Return the ids that objects of a night had in an earlier one, where their motion decides.
-
-    Parameters
-    ----------
-    folder
-        The night's folder; its `states` are written.
-    objects
-        Ids of the objects to recognise. Ids that an earlier night knows already are skipped.
-    earlier
-        STATES of earlier nights.
-
-    Notes
-    -----
-    The last state of the earlier object is propagated to the first one of the night; see
-    `link_by_motion` for forces, process noise and when a link is refused.
-    """
-    gap_s = earlier_h * HOUR_S
-    if not (len(objects) and earlier.num_rows and gap_s > 0.0):
-        return {}
-    before = pl.DataFrame(earlier)
-    new = pl.DataFrame(read_columns(folder, "states", STATES.names))
-    new = new.filter(
-        pl.col("object_id").is_in(list(objects))
-        & ~pl.col("object_id").is_in(before["object_id"].unique().to_list())
-    )
-    old = before.sort("epoch").unique("object_id", keep="last").sort("object_id")
-    new = new.sort("epoch").unique("object_id", keep="first").sort("object_id")
-    if not (len(old) and len(new)):
-        return {}
-    both = pl.concat([old, new])
-    is_old = np.arange(len(both)) < len(old)
-    links, _ = link_by_motion(
-        _motions(both),
-        gap_s=gap_s,
-        log_odds=log_odds,
-        allowed=is_old[:, None] & ~is_old,
-    )
-    names = both["object_id"].to_list()
-    return {names[k]: names[i] for k, i in enumerate(links.tolist()) if i >= 0}
-
-
-def _motions(states: pl.DataFrame) -> ObservedMotions:
-    """Return motions that are known at one instant each."""
-    time_ns = states["epoch"].cast(pl.Int64).to_numpy()
-    at_s = (time_ns - time_ns.min()) / 1e9
-    motion = states.select([*POSITION, *VELOCITY]).to_numpy()
-    cov = stack_covariance(states, "cov_{}", STATE_AXES)
-    return ObservedMotions(at_s, at_s, at_s, at_s, motion, motion, cov, cov)
-
-
-# The judgement of all objects.
 
 SURE = 0.999  # probability of a match from which errors are learnt
 COVARIANCE = ["cov_xx", "cov_xy", "cov_xz", "cov_yy", "cov_yz", "cov_zz"]
@@ -107,7 +57,7 @@ COVARIANCE = ["cov_xx", "cov_xy", "cov_xz", "cov_yy", "cov_yz", "cov_zz"]
 def name_known_objects(
     folder: Path,
     known: ElementsOfNight | None,
-    earlier: pa.Table,
+    earlier: EarlierObjects,
     settings: KnownObjectSettings,
     link_log_odds: float,
 ) -> list[SensorResidual]:
@@ -120,7 +70,7 @@ def name_known_objects(
     known
         None: without a catalogue; all objects are unknown, and other tracklets have no rows.
     earlier
-        STATES of earlier nights.
+        Objects of earlier nights.
 
     Returns
     -------
@@ -135,17 +85,25 @@ def name_known_objects(
         named = name_tracklets(folder, list(observed), learnt, settings.probability)
         others = tracklet_rows(named, known)
     verdicts = _without_rivals(verdicts, spans)
-    unnamed = [name for name in observed if _status(verdicts, name) != "known"]
-    same_as = recognise_objects(folder, unnamed, earlier, settings.earlier_h, link_log_odds)
     objects = sorted(observed.keys() | _seen_objects(folder) - set(others["object_id"].to_pylist()))
-    rows = concat(IDENTIFICATIONS, [_rows(objects, verdicts, known, same_as), others])
-    write_table(folder, "identifications", [rows.sort_by([("object_id", "ascending")])])
+    rows = concat(IDENTIFICATIONS, [_rows(objects, verdicts, known), others])
+    same_as = recognise_objects(folder, _unknown(rows), earlier, settings.earlier_h, link_log_odds)
+    before = pl.col("object_id").replace_strict(same_as, default=None, return_dtype=pl.String)
+    known_as = to_polars(rows).with_columns(same_as=before)
+    known_as = known_as.sort("object_id", nulls_last=True, maintain_order=True)
+    write_table(folder, "identifications", [from_polars(IDENTIFICATIONS, known_as)])
     if known is None:
         return []
     return sensor_residuals(
         folder,
         {n: known.sets[v.best.row] for n, v in verdicts.items() if v.status == "known" and v.best},
     )
+
+
+def _unknown(rows: pa.Table) -> list[str]:
+    """Return the objects of IDENTIFICATIONS that no catalogue names."""
+    named = rows_with(rows, "status", NameStatus.KNOWN)["object_id"]
+    return sorted(set(rows["object_id"].to_pylist()) - set(named.to_pylist()) - {None})
 
 
 def _seen_objects(folder: Path) -> set[str]:
@@ -238,7 +196,6 @@ def _rows(
     objects: Sequence[str],
     verdicts: Mapping[str, NameVerdict],
     known: ElementsOfNight | None,
-    same_as: Mapping[str, str],
 ) -> pa.Table:
     """Return IDENTIFICATIONS: a row per object, in order of their ids."""
     sets = known.sets if known is not None else []
@@ -256,7 +213,7 @@ def _rows(
             "object_id": list(objects),
             "tracklet_id": [None] * len(objects),
             "status": [_status(verdicts, name) for name in objects],
-            "same_as": [same_as.get(name) for name in objects],
+            "same_as": [None] * len(objects),
             "distance_km": [each.distance_km if each else None for each in best],
             "mahalanobis": [each.mahalanobis if each else None for each in best],
             "probability": [verdict.probability if verdict else None for verdict in of],

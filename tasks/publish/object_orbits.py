@@ -8,10 +8,8 @@ import numpy.typing as npt
 import polars as pl
 from scipy.special import chdtrc
 
-from epipole.io.catalogues.earth_orientation import read_earth_orientation
 from epipole.schemas.columns import POSITION
 from epipole.schemas.rejects import Reason
-from epipole.schemas.spans import DAY_NS
 from epipole.schemas.work_tables import SHARED_OBSERVATIONS
 from epipole.tasks.algorithms.constants import (
     ARCSEC,
@@ -20,7 +18,7 @@ from epipole.tasks.algorithms.constants import (
     SECOND_NS,
 )
 from epipole.tasks.algorithms.geometry.directions import east_north, unit_from_radec
-from epipole.tasks.algorithms.orbits.forces import Surroundings, surroundings
+from epipole.tasks.algorithms.orbits.forces import Surroundings
 from epipole.tasks.algorithms.orbits.initial_orbit import initial_orbit
 from epipole.tasks.algorithms.orbits.orbit_determination import (
     AreaPrior,
@@ -31,6 +29,14 @@ from epipole.tasks.algorithms.orbits.orbit_determination import (
     neglected,
 )
 from epipole.tasks.common.grouping import factorize, group_offsets
+from epipole.tasks.common.orbit_forces import (
+    AIR_AREA,
+    DRAG,
+    GRAVITY,
+    RADIATION,
+    RADIATION_KM,
+    SUNLIT_AREA,
+)
 from epipole.tasks.publish.sensor_errors import SensorSums, summed_equations
 
 Array = npt.NDArray[np.float64]
@@ -39,13 +45,7 @@ MIN_PROBABILITY = 1e-6  # of a chi-square: an orbit with a less probable one is 
 MIN_BIAS_ARCSEC = 1e-3  # keeps the prior invertible if nothing is shared
 MIN_POSITION_KM = 1e-6
 
-# Radiation moves what stays above this altitude more than air does.
-RADIATION_KM = 1000.0
-# Area over mass in sunlight, coefficient included: of satellites 0.01 to 0.05 m^2/kg. In the air
-# twice that is usual, and the static density may be off by a factor of three.
-SUNLIT_AREA, AIR_AREA = (0.02, 0.02), (0.03, 0.06)  # mean and sigma [m^2/kg]
 SHORTEST_DRAG_S = 1800.0  # in less the air moves no satellite above 300 km by its errors
-GRAVITY, RADIATION, DRAG = "GM J2-J4 C22 Sun Moon", "radiation", "drag"
 
 # Columns of OBSERVATIONS that orbits are fitted to.
 OBSERVED = [name for name in SHARED_OBSERVATIONS.names if name not in ("share", "row")]
@@ -56,23 +56,6 @@ class Start(NamedTuple):
 
     time_ns: int
     state: Array
-
-
-def surroundings_of(night: str, ahead_ns: int = 0) -> Surroundings:
-    """Return what acts on satellites in a night and half a day around it; times from its noon.
-
-    `ahead_ns` is how much later it ends.
-    """
-    noon = noon_ns(night)
-    earth = read_earth_orientation()
-    days = np.datetime64(night, "D") - np.datetime64("1858-11-17", "D")
-    ut1_utc_s = float(np.interp(days.astype(float), earth.mjd, earth.ut1_utc_s))
-    return surroundings(noon, noon - DAY_NS, noon + DAY_NS + ahead_ns, ut1_utc_s)
-
-
-def noon_ns(night: str) -> int:
-    """Return the noon of a night, from which its times count, since 1970 [ns]."""
-    return int(np.datetime64(night, "ns").astype(np.int64)) + DAY_NS // 2
 
 
 def turned(rotation: Array, vectors: Array) -> Array:

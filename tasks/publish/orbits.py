@@ -33,6 +33,7 @@ from epipole.tasks.algorithms.orbits.orbital_elements import (
     elements_of,
     geostationary,
 )
+from epipole.tasks.common.orbit_forces import noon_ns, surroundings_of
 from epipole.tasks.common.stage_tasks import stage_task
 from epipole.tasks.publish.fitted_observations import fitted_part, write_fitted
 from epipole.tasks.publish.object_orbits import (
@@ -42,9 +43,7 @@ from epipole.tasks.publish.object_orbits import (
     best_orbit,
     both,
     judge,
-    noon_ns,
     observed_objects,
-    surroundings_of,
     turned,
 )
 from epipole.tasks.publish.sensor_errors import SensorSums, sensor_errors

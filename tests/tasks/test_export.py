@@ -10,10 +10,10 @@ from epipole.io.ccsds import Subject
 from epipole.schemas.bridge import to_polars
 from epipole.schemas.columns import POSITION, STATE_AXES, VELOCITY
 from epipole.schemas.tables import IDENTIFICATIONS, ORBITS, POSITIONS, STATES
+from epipole.tasks.common.orbit_forces import areas_in
 from epipole.tasks.export import (
     HALF_ARC_S,
     arcs,
-    areas_in,
     orbit_arc,
     positive,
     single_states,

@@ -5,6 +5,7 @@ decides whether they are one object: the density of the difference of the states
 covariances, against the density of new objects. The latter is taken from the objects nearby.
 """
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
@@ -16,6 +17,8 @@ from epipole.tasks.algorithms.orbits.orbit_fit import trajectory
 
 Array = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int64]
+# Returns the last state of an object after times (m,) [s], (m, 6), with covariances (m, 6, 6).
+Mover = Callable[[int, Array], tuple[Array, Array]]
 
 NONE = -1
 MAX_ENERGY_SIGMA = 10.0  # gate of the difference of the energies
@@ -59,6 +62,7 @@ def link_by_motion(
     gap_s: float,
     log_odds: float,
     allowed: npt.NDArray[np.bool_] | None = None,
+    moved: Mover | None = None,
 ) -> tuple[Indices, Array]:
     """Return which earlier object each object continues.
 
@@ -73,6 +77,9 @@ def link_by_motion(
         object is not linked if two others could continue it equally well.
     allowed : (n, n) bool
         Whether the first may continue as the second; None: any.
+    moved
+        Moves the last state of an earlier object, whose velocity is known. None: two bodies and J2,
+        with process noise for the neglected forces.
 
     Returns
     -------
@@ -84,11 +91,10 @@ def link_by_motion(
     Notes
     -----
     Errors that the sensors keep over the gap are counted in both states: the test is conservative.
-    Forces: two bodies and J2. Process noise stands for the neglected forces.
     """
     n = len(motions.first_s)
     before, odds = np.full(n, NONE), np.full(n, np.nan)
-    pairs = _pairs(motions, gap_s, allowed)
+    pairs = _pairs(motions, gap_s, allowed, moved)
     links = _Links(motions, gap_s, pairs, _log_odds_of_pairs(motions, pairs))
     for members, joined in links.joined(log_odds):
         for k in range(1, len(members)):
@@ -118,7 +124,10 @@ class _CandidatePairs(NamedTuple):
 
 
 def _pairs(
-    motions: ObservedMotions, gap_s: float, allowed: npt.NDArray[np.bool_] | None = None
+    motions: ObservedMotions,
+    gap_s: float,
+    allowed: npt.NDArray[np.bool_] | None = None,
+    moved: Mover | None = None,
 ) -> _CandidatePairs:
     """Return the pairs that may be one object, by time and energy, with their differences."""
     gap = motions.first_s - motions.last_s[:, None]
@@ -131,9 +140,11 @@ def _pairs(
     for i in np.flatnonzero(moving):  # forward, from each earlier object
         later = np.flatnonzero(kept[i])
         later = later[np.argsort(motions.head_s[later], kind="stable")]
-        state, cov = _propagated(
-            motions.tail[i], motions.tail_cov[i], motions.head_s[later] - motions.tail_s[i]
-        )
+        dt_s = motions.head_s[later] - motions.tail_s[i]
+        if moved is None:
+            state, cov = _propagated(motions.tail[i], motions.tail_cov[i], dt_s)
+        else:
+            state, cov = moved(int(i), dt_s)
         earlier = np.full(len(later), i)
         parts.append((earlier, later, motions.head[later] - state, motions.head_cov[later] + cov))
     for j in np.flatnonzero(moves):  # backward, to earlier objects of unknown velocity

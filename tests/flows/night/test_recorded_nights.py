@@ -39,7 +39,7 @@ def test_the_end_of_the_night_before_is_read(tmp_path):
     write(tmp_path, "2019-04-01", [24.1], ["w"])
     nights = EarlierNights(str(tmp_path), {})
     assert ids(nights.last_views(NIGHT)) == ["y", "z"]
-    assert ids(nights.last_states(NIGHT, SETTINGS)) == ["w", "x", "y", "z"]
+    assert ids(nights.last_objects(NIGHT, SETTINGS).states) == ["w", "x", "y", "z"]
 
 
 def test_only_as_many_hours_are_read_as_are_asked_for(tmp_path):
@@ -47,8 +47,8 @@ def test_only_as_many_hours_are_read_as_are_asked_for(tmp_path):
     short = Settings(known_objects=KnownObjectSettings(earlier_h=1.0))
     none = Settings(known_objects=KnownObjectSettings(earlier_h=0.0))
     nights = EarlierNights(str(tmp_path), {})
-    assert ids(nights.last_states(NIGHT, short)) == ["y"]
-    assert ids(nights.last_states(NIGHT, none)) == []
+    assert ids(nights.last_objects(NIGHT, short).states) == ["y"]
+    assert ids(nights.last_objects(NIGHT, none).states) == []
 
 
 def test_a_night_of_this_run_counts_more_than_that_of_the_dataset(tmp_path):
@@ -56,13 +56,13 @@ def test_a_night_of_this_run_counts_more_than_that_of_the_dataset(tmp_path):
     new = write(tmp_path / "staging", "2019-04-02", [0.1], ["new"])
     nights = EarlierNights(str(tmp_path / "out"), {"2019-04-02": new})
     assert ids(nights.last_views(NIGHT)) == ["new"]
-    assert ids(nights.last_states(NIGHT, SETTINGS)) == ["new"]
+    assert ids(nights.last_objects(NIGHT, SETTINGS).states) == ["new"]
 
 
 def test_without_earlier_nights_there_are_no_rows(tmp_path):
     nights = EarlierNights(str(tmp_path / "none"), {})
     assert nights.last_views(NIGHT).num_rows == 0
-    assert nights.last_states(NIGHT, SETTINGS).num_rows == 0
+    assert nights.last_objects(NIGHT, SETTINGS).states.num_rows == 0
 
 
 def test_a_damaged_night_is_left_aside_with_a_line(tmp_path, caplog):
@@ -72,7 +72,7 @@ def test_a_damaged_night_is_left_aside_with_a_line(tmp_path, caplog):
     nights = EarlierNights(str(tmp_path), {})
     with caplog.at_level(logging.WARNING, "epipole"):
         assert nights.last_views(NIGHT).num_rows == 0
-        assert nights.last_states(NIGHT, SETTINGS).num_rows == 0
+        assert nights.last_objects(NIGHT, SETTINGS).states.num_rows == 0
     assert "not recognised from the night 2019-04-02" in caplog.text
 
 
@@ -112,7 +112,7 @@ def test_a_night_of_another_program_has_one_line_and_the_run_goes_on(tmp_path, a
     nights = EarlierNights(str(tmp_path), {})
     with caplog.at_level(logging.WARNING, "epipole"):
         assert nights.last_views(NIGHT).num_rows == 0
-        assert ids(nights.last_states(NIGHT, SETTINGS)) == ["w"]
+        assert ids(nights.last_objects(NIGHT, SETTINGS).states) == ["w"]
     (line,) = caplog.messages
     assert "2019-04-02" in line
     assert "\n" not in line
@@ -125,7 +125,7 @@ def test_states_that_are_no_numbers_are_left_aside(tmp_path):
     for name, values in (("x_km", [np.nan, 1.0, 1.0]), ("cov_xx", [1.0, np.inf, 1.0])):
         rows = rows.set_column(rows.schema.get_field_index(name), name, pa.array(values))
     pq.write_table(rows, path)
-    assert ids(EarlierNights(str(tmp_path), {}).last_states(NIGHT, SETTINGS)) == ["z"]
+    assert ids(EarlierNights(str(tmp_path), {}).last_objects(NIGHT, SETTINGS).states) == ["z"]
 
 
 # Reads what a run reads of earlier nights, and prints how much it found.
@@ -135,7 +135,8 @@ from epipole.flows.night.recorded_nights import EarlierNights
 from epipole.schemas.settings import Settings
 nights = EarlierNights(sys.argv[1], {})
 key = nights.key("2019-04-03", Settings())
-views, states = nights.last_views("2019-04-03"), nights.last_states("2019-04-03", Settings())
+views = nights.last_views("2019-04-03")
+states = nights.last_objects("2019-04-03", Settings()).states
 # Not ru_maxrss: a child begins with its parent's.
 peak_mb = int(open("/proc/self/status").read().split("VmHWM:")[1].split()[0]) // 1000
 print(views.num_rows, states.num_rows, peak_mb)

@@ -2,6 +2,7 @@
 
 import numpy as np
 import polars as pl
+import pyarrow as pa
 import pytest
 from scenes.associations import filled
 from scenes.seen_tracklets import as_table, seen_from_near
@@ -10,8 +11,9 @@ from scenes.walker import NIGHT_NS, satellites
 from epipole.io.datasets.night_tables import PART, write_table
 from epipole.schemas.columns import POSITION, STATE_AXES, VELOCITY, upper_triangle
 from epipole.schemas.settings import KnownObjectSettings, Settings
-from epipole.schemas.tables import OBSERVATIONS, POSITIONS, STATES, TRACKLETS
+from epipole.schemas.tables import OBSERVATIONS, ORBITS, POSITIONS, STATES, TRACKLETS
 from epipole.tasks.algorithms.known_objects.prediction import predict, satellites_of
+from epipole.tasks.name.earlier_objects import EarlierObjects
 from epipole.tasks.name.elements_of_night import ElementsOfNight
 from epipole.tasks.name.known_objects import name_known_objects
 
@@ -61,8 +63,8 @@ def observations(seen, sensors):
     return pl.concat(parts).to_arrow().cast(OBSERVATIONS)
 
 
-def states(seen, sigma_km=0.05, sigma_km_s=1e-5):
-    """One state of each object, at its first time."""
+def states(seen, sigma_km=0.05, sigma_km_s=1e-5, schema=STATES, **columns):
+    """One state, or orbit, of each object, at its first time."""
     variance = np.diag([sigma_km**2] * 3 + [sigma_km_s**2] * 3)
     rows = {"epoch": [], "object_id": []} | {name: [] for name in (*POSITION, *VELOCITY)}
     for name, (each, times) in seen.items():
@@ -74,22 +76,34 @@ def states(seen, sigma_km=0.05, sigma_km_s=1e-5):
         upper_triangle(STATE_AXES), zip(*np.triu_indices(6), strict=True), strict=True
     ):
         rows[f"cov_{a}{b}"] = [variance[i, j]] * len(seen)
-    return filled(STATES, len(seen), rows)
+    return filled(schema, len(seen), rows | columns)
+
+
+def orbits(seen, sigma_km=0.05, sigma_km_s=1e-4):
+    """One orbit of each object, of ten minutes about its first time."""
+    n = len(seen)
+    return states(seen, sigma_km, sigma_km_s, ORBITS, arc_s=[600.0] * n,
+                  forces=["GM J2-J4 C22 Sun Moon"] * n)  # fmt: skip
 
 
 @pytest.fixture
 def named(tmp_path):
     """Return a function that names the objects of a night, and returns the table's rows."""
 
-    def name(seen, known, *, earlier=None, sensors=(), settings=None, tracklets=None, unsolved=()):
+    def name(seen, known, *, earlier=None, earlier_orbits=None, sensors=(), settings=None,
+             tracklets=None, unsolved=()):  # fmt: skip
         solved = {name: of for name, of in seen.items() if name not in unsolved}
         tables = {"positions": positions(np.random.default_rng(1), solved),
                   "states": states(solved),
+                  "orbits": orbits(seen) if earlier_orbits else ORBITS.empty_table(),
                   "observations": observations(seen, sensors),
                   "tracklets": tracklets or TRACKLETS.empty_table()}  # fmt: skip
         for table, rows in tables.items():
             write_table(tmp_path, table, [rows])
-        before = states(earlier) if earlier else STATES.empty_table()
+        before = EarlierObjects(
+            states(earlier) if earlier else STATES.empty_table(),
+            ORBITS.empty_table() if earlier_orbits is None else earlier_orbits,
+        )
         settings = settings or Settings()
         residuals = name_known_objects.fn(
             tmp_path, known, before, settings.known_objects, settings.states.link_log_odds
@@ -155,6 +169,31 @@ def test_an_unknown_object_is_recognised_as_one_of_an_earlier_night(named, fleet
     off = Settings(known_objects=KnownObjectSettings(earlier_h=0.0))
     rows, _ = named(seen, None, earlier=before, settings=off)
     assert rows["same_as"].to_list() == [None, None]
+
+
+def test_objects_that_have_only_orbits_are_recognised_a_day_later(named, fleet):
+    low = [each for each in fleet if each.elements[8] > 0.04][:8]
+    before = orbits({f"old{k}": (each, seconds(-70_000)) for k, each in enumerate(low)})
+    seen = {f"new{k}": (each, seconds(9000)) for k, each in enumerate(low[2:], start=2)}
+    solved_by_none = {"sensors": [("a", np.zeros(3), 0.0)], "unsolved": list(seen)}
+    rows, _ = named(seen, None, earlier_orbits=before, **solved_by_none)
+    assert rows["same_as"].to_list() == [f"old{k}" for k in range(2, 8)]
+    # Of two that may be the same, none.
+    twin = before.slice(2, 1).set_column(
+        before.schema.get_field_index("object_id"), "object_id", [pa.array(["twin"])]
+    )
+    both = pa.concat_tables([before, twin.cast(before.schema)])
+    rows, _ = named(seen, None, earlier_orbits=both, **solved_by_none)
+    assert rows["same_as"].to_list() == [None, *(f"old{k}" for k in range(3, 8))]
+
+
+def test_vague_orbits_recognise_no_objects(named, fleet):
+    low = [each for each in fleet if each.elements[8] > 0.04][:3]
+    before = {f"old{k}": (each, seconds(-70_000)) for k, each in enumerate(low)}
+    seen = {f"new{k}": (each, seconds(9000)) for k, each in enumerate(low)}
+    rows, _ = named(seen, None, earlier_orbits=orbits(before, sigma_km=200.0),
+                    sensors=[("a", np.zeros(3), 0.0)], unsolved=list(seen))  # fmt: skip
+    assert rows["same_as"].to_list() == [None] * 3
 
 
 def test_known_objects_and_those_that_kept_their_id_are_not_asked(named, fleet):

@@ -18,9 +18,9 @@ from epipole.schemas.tables import OBSERVATIONS, ORBITS, POSITIONS, REJECTS, SEN
 from epipole.tasks.algorithms.constants import ARCSEC
 from epipole.tasks.algorithms.orbits.illumination import illumination
 from epipole.tasks.algorithms.orbits.orbital_elements import elements_of
+from epipole.tasks.common.orbit_forces import surroundings_of
 from epipole.tasks.publish import orbits
 from epipole.tasks.publish.fitted_observations import complete_observations
-from epipole.tasks.publish.object_orbits import surroundings_of
 from epipole.tasks.publish.orbits import fit_orbits, write_orbits
 from epipole.tasks.publish.share_out import share_out
 
