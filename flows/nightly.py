@@ -254,10 +254,10 @@ def stage_night(
     rejects = concat(REJECTS, [whole["rejects"], made.rejects, unused])
     whole = {**whole, **made.tables, "rejects": rejects}
     linked = write_night(made.work, made.solved, date, names, whole, staged, settings)
-    misfits = determine_orbits(staged, date, linked)
+    verdicts = determine_orbits(staged, date, linked)
     before = earlier.last_objects(date, settings)
     residuals = name_known(staged, elements, before, settings)
-    list_objects(staged, date, misfits)
+    list_objects(staged, date, verdicts)
     faults = [verdict for verdict in made.work.verdicts if verdict.is_faulty]
     write_night_row(staged, recipe, earlier_key, faults, residuals)
 

@@ -324,11 +324,16 @@ class Reason(StrEnum):
         Stage.SOLVE,
         "The chi-square of an object's state does not fit its degrees of freedom.",
     )
+    MANOEUVRE = (
+        "manoeuvre",
+        Stage.SOLVE,
+        "The object changed its orbit at this time; its observations before are not in its orbit.",
+    )
     ORBIT_MISFIT = (
         "orbit_misfit",
         Stage.SOLVE,
-        "The chi-square of an object's orbit does not fit its degrees of freedom: it changed its "
-        "orbit, or its observations are of more than one object.",
+        "The chi-square of an object's orbit does not fit its degrees of freedom: its observations "
+        "are of more than one object, or it changed its orbit more than once.",
     )
     NO_ORBIT = (
         "no_orbit",
@@ -452,10 +457,15 @@ class ObjectVerdict(Declared):
         "Sensors of the night disagree, and who is wrong is not clear: the errors of its positions "
         "are as large as that shows; see `checks`.",
     )
+    MANOEUVRED = (
+        "manoeuvred",
+        "It changed its orbit: one orbit fits its observations before a time, another one those "
+        "after it, and both meet then; `orbits` has the later one.",
+    )
     ORBIT_MISFIT = (
         "orbit_misfit",
-        "No single orbit fits its observations: it changed its orbit, or they are of more than "
-        "one object.",
+        "No single orbit fits its observations: they are of more than one object, or it changed "
+        "its orbit more than once.",
     )
     NO_ORBIT = (
         "no_orbit",

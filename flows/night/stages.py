@@ -21,7 +21,7 @@ from epipole.io.catalogues.element_sets import KnownObjects
 from epipole.io.work.parts import IDENTIFIED, Parts, write_part
 from epipole.io.work.work_layout import ReadFolder, SolvedParts, WorkFolder
 from epipole.schemas.bridge import array, concat
-from epipole.schemas.rejects import Reason
+from epipole.schemas.rejects import ObjectVerdict, Reason
 from epipole.schemas.settings import Settings
 from epipole.schemas.spans import DAY_NS, SPAN_NS, Span, day_of
 from epipole.schemas.stages import Stage
@@ -326,10 +326,10 @@ def write_night(
     return orbits
 
 
-def determine_orbits(folder: Path, night: str, linked: pa.Table) -> list[str]:
+def determine_orbits(folder: Path, night: str, linked: pa.Table) -> dict[str, ObjectVerdict]:
     """Fit the orbits of a night whose tables are written, and write them; see `fit_orbits`.
 
-    Returns the objects whose observations fit no orbit.
+    Returns the verdicts of objects whose observations fit no single orbit.
     """
     shares = orbit_shares(folder, night)
     results(Stage.PUBLISH, [share_out.submit(folder, night, shares)])
@@ -338,12 +338,12 @@ def determine_orbits(folder: Path, night: str, linked: pa.Table) -> list[str]:
     (count,) = results(Stage.PUBLISH, [write_orbits.submit(folder, night, fitted)])
     results(Stage.PUBLISH, [complete_observations.submit(folder, night, shares)])
     LOGGER.info("fitted %s", many(count, "orbit"))
-    return [name for each in fitted for name in each.misfits]
+    return {name: verdict for each in fitted for name, verdict in each.verdicts.items()}
 
 
-def list_objects(folder: Path, night: str, misfits: Sequence[str]) -> None:
+def list_objects(folder: Path, night: str, verdicts: Mapping[str, ObjectVerdict]) -> None:
     """Write the objects of a night whose other tables are written; see `write_objects`."""
-    results(Stage.PUBLISH, [write_objects.submit(folder, night, misfits)])
+    results(Stage.PUBLISH, [write_objects.submit(folder, night, verdicts)])
 
 
 def _link(parts: NightParts, settings: Settings) -> tuple[NightParts, pa.Table]:

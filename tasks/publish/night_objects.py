@@ -1,6 +1,6 @@
 """Objects of a night: a row for each, made from the other tables."""
 
-from collections.abc import Collection
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
@@ -30,16 +30,16 @@ _NAMES = ["norad_id", "cospar_id", "name"]
 
 
 @stage_task(Stage.PUBLISH, "objects of {night}")
-def write_objects(folder: Path, night: str, misfits: Collection[str]) -> int:
+def write_objects(folder: Path, night: str, verdicts: Mapping[str, ObjectVerdict]) -> int:
     """Write the table `objects` of a night whose other tables are written; return its rows.
 
-    `misfits` are the objects whose observations fit no orbit.
+    `verdicts` are those of objects whose observations fit no single orbit.
     """
     reader = NightReader.of_folder(folder, night)
-    return write_table(folder, "objects", [objects_of(reader, misfits)])
+    return write_table(folder, "objects", [objects_of(reader, verdicts)])
 
 
-def objects_of(reader: NightReader, misfits: Collection[str]) -> pa.Table:
+def objects_of(reader: NightReader, verdicts: Mapping[str, ObjectVerdict]) -> pa.Table:
     """Return OBJECTS of a night: all that have a position or an observation in it, in order."""
     seen, solved = _observed(reader), _solved(reader)
     rows = seen.join(solved, on="object_id", how="full", coalesce=True, suffix="_solved")
@@ -53,7 +53,7 @@ def objects_of(reader: NightReader, misfits: Collection[str]) -> pa.Table:
         found=pl.when(pl.col("n_positions") > 0)
         .then(pl.lit(Found.TOGETHER.value))
         .otherwise(pl.lit(Found.LINKED.value)),
-        verdict=_verdicts(rows, pl.Series(list(misfits), dtype=pl.String), has_orbit),
+        verdict=_verdicts(rows, verdicts, has_orbit),
     )
     names = reader.read("identifications", ["object_id", "status", *_NAMES])
     known = names.filter(pl.col("status") == NameStatus.KNOWN.value).drop_nulls("object_id")
@@ -121,7 +121,9 @@ def _solved(reader: NightReader) -> pl.DataFrame:
     )  # fmt: skip
 
 
-def _verdicts(rows: pl.DataFrame, misfits: pl.Series, has_orbit: pl.Series) -> pl.Series:
+def _verdicts(
+    rows: pl.DataFrame, of_orbits: Mapping[str, ObjectVerdict], has_orbit: pl.Series
+) -> pl.Series:
     """Return the `ObjectVerdict` of each object.
 
     Positions share errors, so the mean of their chi-squares is compared with that of one position.
@@ -138,7 +140,8 @@ def _verdicts(rows: pl.DataFrame, misfits: pl.Series, has_orbit: pl.Series) -> p
         ObjectVerdict.TWO_SENSORS_DISAGREE: disagrees & is_two,
         ObjectVerdict.SENSORS_DISAGREE: disagrees | is_rejected,
         ObjectVerdict.SENSORS_IN_DOUBT: pl.col("in_doubt"),
-        ObjectVerdict.ORBIT_MISFIT: pl.col("object_id").is_in(misfits.implode()),
+        ObjectVerdict.MANOEUVRED: _has(of_orbits, ObjectVerdict.MANOEUVRED),
+        ObjectVerdict.ORBIT_MISFIT: _has(of_orbits, ObjectVerdict.ORBIT_MISFIT),
         ObjectVerdict.NO_ORBIT: pl.col("object_id").is_in(has_orbit.implode()).not_(),
     }
     verdicts = pl.coalesce(
@@ -146,3 +149,8 @@ def _verdicts(rows: pl.DataFrame, misfits: pl.Series, has_orbit: pl.Series) -> p
         pl.lit(ObjectVerdict.SOUND.value),
     )
     return rows.select(verdicts.alias("verdict")).to_series()
+
+
+def _has(verdicts: Mapping[str, ObjectVerdict], verdict: ObjectVerdict) -> pl.Expr:
+    names = [name for name, each in verdicts.items() if each == verdict]
+    return pl.col("object_id").is_in(pl.Series(names, dtype=pl.String).implode())

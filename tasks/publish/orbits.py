@@ -21,7 +21,7 @@ from epipole.schemas.bridge import (
     unstack_covariance,
 )
 from epipole.schemas.columns import ELEMENTS, POSITION, STATE_AXES, VELOCITY
-from epipole.schemas.rejects import Reason, reject_rows
+from epipole.schemas.rejects import ObjectVerdict, Reason, reject_rows
 from epipole.schemas.stages import Stage
 from epipole.schemas.tables import ORBITS, REJECTS
 from epipole.tasks.algorithms.constants import DAY_S, SECOND_NS
@@ -36,6 +36,7 @@ from epipole.tasks.algorithms.orbits.orbital_elements import (
 from epipole.tasks.common.orbit_forces import noon_ns, surroundings_of
 from epipole.tasks.common.stage_tasks import stage_task
 from epipole.tasks.publish.fitted_observations import fitted_part, write_fitted
+from epipole.tasks.publish.manoeuvres import find_manoeuvre
 from epipole.tasks.publish.object_orbits import (
     FittedOrbit,
     ObservedObjects,
@@ -52,19 +53,20 @@ from epipole.tasks.publish.share_out import of_share
 Array = npt.NDArray[np.float64]
 
 ROWS_OF_TASK = 300_000  # observations, about
+OF_ORBITS = (Reason.MANOEUVRE, Reason.ORBIT_MISFIT, Reason.NO_ORBIT)
 SLOPE_S = 60.0  # positions within this time of the middle one give the initial velocity
 
 
 class OrbitRows(NamedTuple):
     """ORBITS of some objects, and rows of `rejects` for the others.
 
-    `misfits` are the objects whose observations fit no orbit. `sensors` are the sums from which the
-    sensors' errors are estimated.
+    `verdicts` are those of objects whose observations fit no single orbit. `sensors` are the sums
+    from which the sensors' errors are estimated.
     """
 
     orbits: pa.Table
     rejects: pa.Table
-    misfits: list[str]
+    verdicts: dict[str, ObjectVerdict]
     sensors: SensorSums
 
 
@@ -98,6 +100,15 @@ def fit_orbits(
         for k, name in enumerate(objects.names)
     ]
     reasons = [judge(each) for each in fitted]
+    changed = {
+        k: found
+        for k, each in enumerate(fitted)
+        if each is not None
+        and reasons[k] == Reason.ORBIT_MISFIT
+        and (found := find_manoeuvre(objects.directions(k), each, origin_ns, around))
+    }
+    for k, manoeuvre in changed.items():
+        fitted[k], reasons[k] = manoeuvre.after, None
     sound = {k: each for k, each in enumerate(fitted) if each is not None and reasons[k] is None}
     failed = [k for k in range(len(fitted)) if k not in sound]
     without = {objects.names[k] for k in failed}
@@ -106,14 +117,18 @@ def fit_orbits(
         fitted_part(folder, share, shares), observed, objects.slices(), sound, positions, origin_ns,
         around,
     )  # fmt: skip
+    times_ns = [objects.middle_ns(k) for k in failed]
+    times_ns += [origin_ns + round(each.time_s * SECOND_NS) for each in changed.values()]
+    misfits = [k for k in failed if reasons[k] == Reason.ORBIT_MISFIT]
     return OrbitRows(
         orbit_table(objects, sound, origin_ns, around),
         reject_rows(
-            [reason for reason in reasons if reason is not None],
-            time=[objects.middle_ns(k) for k in failed],
-            count=[1] * len(failed),
+            [*filter(None, reasons), *[Reason.MANOEUVRE] * len(changed)],
+            time=times_ns,
+            count=[*[1] * len(failed), *(each.n_before for each in changed.values())],
         ),
-        [objects.names[k] for k in failed if reasons[k] == Reason.ORBIT_MISFIT],
+        {objects.names[k]: ObjectVerdict.ORBIT_MISFIT for k in misfits}
+        | {objects.names[k]: ObjectVerdict.MANOEUVRED for k in changed},
         objects.sensor_sums(sound),
     )
 
@@ -129,7 +144,7 @@ def write_orbits(folder: Path, night: str, fitted: Sequence[OrbitRows]) -> int:
     write_table(folder, "sensor_errors", [errors])
     orbits = in_order(concat(ORBITS, [each.orbits for each in fitted]))
     earlier = read_columns(folder, "rejects", REJECTS.names)
-    reasons = pa.array([reason.value for reason in (Reason.ORBIT_MISFIT, Reason.NO_ORBIT)])
+    reasons = pa.array([reason.value for reason in OF_ORBITS])
     # A task that was killed as it wrote starts again.
     kept = earlier.filter(pc.invert(pc.is_in(earlier["reason"], reasons)))
     rejects = concat(REJECTS, [kept, *[each.rejects for each in fitted]])

@@ -386,7 +386,7 @@ def determine_orbit(
     shared = np.zeros((len(directions.prior), N_SHARED))
     try:
         for rows in _windows(directions.time_s, start_s):
-            near = _part(directions, rows)
+            near = part_of(directions, rows)
             found = _converge(
                 unknowns, shared, start_s, near, np.ones(len(near.time_s), bool), areas, around
             )
@@ -429,7 +429,7 @@ def _windows(time_s: Array, start_s: float) -> list[Mask]:
     return rows
 
 
-def _part(directions: ObjectDirections, rows: Mask) -> ObjectDirections:
+def part_of(directions: ObjectDirections, rows: Mask) -> ObjectDirections:
     """Return some of the directions. The sensors keep their numbers."""
     time_s, sensor, r_km, u, basis, weight, prior = directions
     return ObjectDirections(

@@ -33,12 +33,12 @@ def rows(table, each):
     })  # fmt: skip
 
 
-def found(seen=(), positions=(), orbits=(), misfits=(), in_group=1000, **tables):
+def found(seen=(), positions=(), orbits=(), verdicts=None, in_group=1000, **tables):
     """Return the objects by their ids; tables are read in groups of so many rows."""
     made = {"orbits": filled("orbits", object_id=list(orbits))} if orbits else {}
     made |= {"observations": rows("observations", seen)} if seen else {}
     made |= {"positions": rows("positions", positions)} if positions else {}
-    table = objects_of(reader_of(made | tables, in_group=in_group), misfits)
+    table = objects_of(reader_of(made | tables, in_group=in_group), verdicts or {})
     return {row["object_id"]: row for row in table.to_pylist()}
 
 
@@ -80,9 +80,17 @@ WORSE = [30.0] * 4  # of one degree of freedom: 1 in 20 million
     ],
 )
 def test_the_first_verdict_that_is_true_counts(seen, positions, misfit, verdict):
-    orbits, misfits = ([], ["o"]) if misfit else (["o"], [])
-    each = found([observed("o", **seen)], [solved("o", **positions)], orbits, misfits)
+    of_orbits = {"o": ObjectVerdict.ORBIT_MISFIT} if misfit else {}
+    orbits = [] if misfit else ["o"]
+    each = found([observed("o", **seen)], [solved("o", **positions)], orbits, of_orbits)
     assert each["o"]["verdict"] == verdict
+
+
+def test_an_object_that_changed_its_orbit_has_one_and_says_so():
+    changed = {"o": ObjectVerdict.MANOEUVRED}
+    each = found([observed("o"), observed("p")], [], ["o", "p"], changed)
+    assert each["o"]["verdict"] == ObjectVerdict.MANOEUVRED
+    assert each["p"]["verdict"] == ObjectVerdict.SOUND
 
 
 def test_in_a_night_in_doubt_objects_with_positions_are_in_doubt():

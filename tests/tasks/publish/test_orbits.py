@@ -6,18 +6,19 @@ import numpy as np
 import polars as pl
 import pytest
 from scenes.associations import filled
-from scenes.night_orbits import GEO, LOW, NOON_NS, trial
+from scenes.night_orbits import AROUND, GEO, LOW, NOON_NS, trial
 from scenes.night_orbits import positions as where
 
 from epipole.io.datasets.night_tables import read_columns, write_table
 from epipole.schemas.bridge import stack, stack_covariance, to_polars
 from epipole.schemas.columns import ELEMENTS, POSITION, SHARED_AXES, STATE_AXES, VELOCITY
 from epipole.schemas.observation import FITTED_FIELDS
-from epipole.schemas.rejects import Reason, reject_rows
+from epipole.schemas.rejects import ObjectVerdict, Reason, reject_rows
 from epipole.schemas.tables import OBSERVATIONS, ORBITS, POSITIONS, REJECTS, SENSOR_ERRORS, STATES
 from epipole.tasks.algorithms.constants import ARCSEC
 from epipole.tasks.algorithms.orbits.illumination import illumination
 from epipole.tasks.algorithms.orbits.orbital_elements import elements_of
+from epipole.tasks.algorithms.orbits.trajectories import propagate_unknowns
 from epipole.tasks.common.orbit_forces import surroundings_of
 from epipole.tasks.publish import orbits
 from epipole.tasks.publish.fitted_observations import complete_observations
@@ -135,6 +136,71 @@ def test_an_arc_of_two_objects_is_a_reject(tmp_path):
     assert rejects["stage"].to_pylist() == ["solve", "solve"]
     # A task that runs again adds nothing.
     assert made(tmp_path)[1].equals(rejects)
+
+
+def changed(truth, at_s, km_s):
+    """Return the orbit at noon that leads to a velocity that is changed at a time."""
+    there, _ = propagate_unknowns(truth, 0.0, at_s, AROUND)
+    there[3:6] += km_s
+    return propagate_unknowns(there, at_s, 0.0, AROUND)[0]
+
+
+def after_and_before(truth, times_s, at_s, km_s, **other):
+    """Return observations of an object that changes its velocity at a time."""
+    later = changed(truth, at_s, km_s)
+    seen = [
+        observed("a", each, times_s=times_s[rows], toward=truth, **other)
+        for each, rows in ((truth, times_s < at_s), (later, times_s >= at_s))
+    ]
+    return seen, later
+
+
+@pytest.mark.parametrize(
+    ("truth", "times_s", "at_s", "km_s"),
+    [
+        (GEO, np.linspace(-5400.0, 5400.0, 80), 1500.0, [2e-3, 1e-3, 0.0]),
+        (LOW, np.concatenate([np.linspace(-300, -200, 20), np.linspace(200, 300, 20)]), 40.0,
+         [0.0, 0.05, 0.05]),
+    ],
+    ids=["geostationary, watched all the time", "low, between two passages"],
+)  # fmt: skip
+def test_a_change_of_the_orbit_is_found(tmp_path, truth, times_s, at_s, km_s):
+    seen, later = after_and_before(truth, times_s, at_s, km_s)
+    written(tmp_path, seen, [state("a", truth)])
+    share_out.fn(tmp_path, NIGHT, 1)
+    fitted = fit_orbits.fn(tmp_path, NIGHT, 0, 1)
+    assert fitted.verdicts == {"a": ObjectVerdict.MANOEUVRED}
+    assert write_orbits.fn(tmp_path, NIGHT, [fitted]) == 1
+    table = read_columns(tmp_path, "orbits", ORBITS.names)
+    row = to_polars(table)
+    epoch_s = (row["epoch"].cast(pl.Int64)[0] - NOON_NS) / 1e9
+    assert epoch_s > at_s
+    there, _ = propagate_unknowns(later, 0.0, epoch_s, AROUND)
+    off = row.select(*POSITION, *VELOCITY).to_numpy()[0] - gcrf(there)
+    cov = stack_covariance(table, "cov_{}", STATE_AXES)[0]
+    assert off @ np.linalg.solve(cov, off) < 22.5  # 1 in 1,000 is above
+    rejects = to_polars(read_columns(tmp_path, "rejects", REJECTS.names))
+    of_change = rejects.filter(pl.col("reason") == "manoeuvre")
+    found_s = (of_change["time"].cast(pl.Int64).item() - NOON_NS) / 1e9
+    assert abs(found_s - at_s) < max(300.0, np.diff(times_s).max())
+    n_before, n_after = (len(each) for each in seen)
+    assert abs(of_change["count"].item() - n_before) <= 0.1 * (n_before + n_after)
+    complete_observations.fn(tmp_path, NIGHT, 1)
+    rows = to_polars(read_columns(tmp_path, "observations", ["time", "residual_sigma"]))
+    is_after = rows["time"].cast(pl.Int64) > NOON_NS + found_s * 1e9
+    assert (rows["residual_sigma"].is_not_null() == is_after).all()
+
+
+def test_two_objects_one_after_the_other_are_no_change_of_an_orbit(tmp_path):
+    times_s = np.linspace(-5400.0, 5400.0, 80)
+    other = GEO + 60.0 * np.eye(8)[2]
+    seen = [
+        observed("a", each, times_s=times_s[rows], toward=GEO)
+        for each, rows in ((GEO, times_s < 0.0), (other, times_s >= 0.0))
+    ]
+    written(tmp_path, seen, [state("a", GEO)])
+    share_out.fn(tmp_path, NIGHT, 1)
+    assert fit_orbits.fn(tmp_path, NIGHT, 0, 1).verdicts == {"a": ObjectVerdict.ORBIT_MISFIT}
 
 
 def test_an_object_without_state_or_position_has_an_orbit_by_its_observations(tmp_path):
