@@ -24,6 +24,8 @@ from epipole.tasks.algorithms.orbit_linking.pair_search import (
     FIRST_GATE,
     MAX_LATER,
     MAX_RANGE_KM,
+    add_pair,
+    dot,
     first_ranges,
     lagrange,
     may_be_one,
@@ -59,11 +61,6 @@ def height_edges() -> Array:
 
 
 @borrowing_kernel
-def _dot(a, b):
-    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
-
-
-@borrowing_kernel
 def _off_circle(across2, along0, slope, radius):
     """Return how far the velocity is from a circular orbit's, as a share of it, at best.
 
@@ -88,14 +85,14 @@ def _off_circle(across2, along0, slope, radius):
 def _may_move_at(tracklets, k, low, high, x, v):
     """Return whether tracklet k may be nearly circular between two distances from the geocentre."""
     r, u, w = tracklets.r_km[k], tracklets.u[k], tracklets.w[k]
-    radius, up = 0.5 * (low + high), _dot(r, u)
-    nearest2 = _dot(r, r) - up * up  # square of the line's least distance
+    radius, up = 0.5 * (low + high), dot(r, u)
+    nearest2 = dot(r, r) - up * up  # square of the line's least distance
     if high * high < nearest2:
         return False
     half = np.sqrt(max(radius * radius - nearest2, 0.0))
     # Half the way of the line between both distances.
     way = 0.5 * (np.sqrt(high * high - nearest2) - np.sqrt(max(low * low - nearest2, 0.0)))
-    along = _dot(tracklets.v_km_s[k], u)
+    along = dot(tracklets.v_km_s[k], u)
     sigma = np.sqrt(tracklets.cov[k, 2, 2] + tracklets.cov[k, 3, 3])
     for side in range(2):
         rho = -up + (half if side else -half)
@@ -105,8 +102,8 @@ def _may_move_at(tracklets, k, low, high, x, v):
         for m in range(3):
             x[m] = r[m] + rho * u[m]
             v[m] = tracklets.v_km_s[k, m] - along * u[m] + rho * w[m]
-        off = _off_circle(_dot(v, v), _dot(x, v), _dot(x, u), radius)
-        uncertain = np.sqrt(_dot(w, w)) * way + 3.0 * sigma * rho
+        off = _off_circle(dot(v, v), dot(x, v), dot(x, u), radius)
+        uncertain = np.sqrt(dot(w, w)) * way + 3.0 * sigma * rho
         if off < NEARLY_CIRCULAR + uncertain / np.sqrt(GM_KM3_S2 / radius):
             return True
     return False
@@ -142,12 +139,12 @@ def _predict(tracklets, i, j, a, q, dt, off, out):
         x, v = d[m], s[m]
         d[m] = f * x + g * v + off[0, m] - tracklets.r_km[j, m]
         s[m] = fdot * x + gdot * v + off[1, m] - tracklets.v_km_s[j, m]
-    b = np.sqrt(_dot(d, d))
+    b = np.sqrt(dot(d, d))
     for c in range(2):
         axis = tracklets.east[j] if c == 0 else tracklets.north[j]
-        out[c] = _dot(axis, d)
-        out[2 + c] = _dot(axis, s) - b * _dot(axis, tracklets.w[j])
-    return (b if _dot(d, tracklets.u[j]) > MIN_COSINE * b else -1.0), g, gdot
+        out[c] = dot(axis, d)
+        out[2 + c] = dot(axis, s) - b * dot(axis, tracklets.w[j])
+    return (b if dot(d, tracklets.u[j]) > MIN_COSINE * b else -1.0), g, gdot
 
 
 @borrowing_kernel
@@ -243,8 +240,8 @@ def _pair_at(tracklets, p, q, i, j, radius, n, state, work):
     for m in range(3):
         state[m] = tracklets.r_km[i, m] + a * tracklets.u[i, m]
         state[3 + m] = tracklets.v_km_s[i, m] + a * tracklets.w[i, m] + rate * tracklets.u[i, m]
-    far = np.sqrt(_dot(state[:3], state[:3]))
-    if far < EARTH_RADIUS_KM + MIN_HEIGHT_KM or _dot(state[3:], state[3:]) > 2.0 * GM_KM3_S2 / far:
+    far = np.sqrt(dot(state[:3], state[:3]))
+    if far < EARTH_RADIUS_KM + MIN_HEIGHT_KM or dot(state[3:], state[3:]) > 2.0 * GM_KM3_S2 / far:
         return np.inf
     return chi2
 
@@ -292,11 +289,7 @@ def search_heights(tracklets, packed, group, possible, edges, max_gap_s, pairs, 
                 chi2 = _pair_at(tracklets, packed[i], packed[j], i, j, radius, n, state, work)
                 if not (chi2 < GATE and may_be_one(tracklets, i, j)):
                     continue
-                if count < len(pairs):
-                    pairs[count, 0], pairs[count, 1] = i, j
-                    for m in range(6):
-                        states[count, m] = state[m]
-                count += 1
+                count = add_pair(i, j, state, count, pairs, states)
     return count
 
 

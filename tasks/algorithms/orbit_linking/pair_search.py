@@ -85,7 +85,8 @@ def lagrange(r, v, dt_s):
 
 
 @borrowing_kernel
-def _dot(a, b):
+def dot(a, b):
+    """Return the product of two vectors (3,)."""
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
@@ -142,15 +143,15 @@ def _ranges(tracklets, i, j, arc, a, b, model_km, oblate):
         k, other, near, far = (i, j, a, b) if side == 0 else (j, i, b, a)
         for c in range(2):
             axis = tracklets.east[k] if c == 0 else tracklets.north[k]
-            of_rate, of_other = -g * _dot(axis, tracklets.w[k]), _dot(axis, tracklets.u[other])
-            right = g * _dot(axis, tracklets.v_km_s[k])
-            half = -0.5 * dt * dt * _dot(axis, oblate)
+            of_rate, of_other = -g * dot(axis, tracklets.w[k]), dot(axis, tracklets.u[other])
+            right = g * dot(axis, tracklets.v_km_s[k])
+            half = -0.5 * dt * dt * dot(axis, oblate)
             if side == 0:
                 pa, pb = of_rate, of_other
-                right -= _dot(axis, sj) + half - f * _dot(axis, si)
+                right -= dot(axis, sj) + half - f * dot(axis, si)
             else:
                 pa, pb = -of_other, of_rate
-                right -= gdot * _dot(axis, sj) - _dot(axis, si) - half
+                right -= gdot * dot(axis, sj) - dot(axis, si) - half
             of_k, others = tracklets.cov[k], tracklets.cov[other]
             variance = near * near * (g * g * of_k[2 + c, 2 + c] + of_k[c, c])
             weight = 1.0 / (variance + far * far * others[c, c] + common)
@@ -183,8 +184,8 @@ def join_pair(tracklets, i, j, first_km, state, work):
         for m in range(3):
             ri[m] = tracklets.r_km[i, m] + a * tracklets.u[i, m]
             rj[m] = tracklets.r_km[j, m] + b * tracklets.u[j, m]
-        r2 = _dot(ri, ri)
-        if min(r2, _dot(rj, rj)) < (EARTH_RADIUS_KM + MIN_HEIGHT_KM) ** 2:
+        r2 = dot(ri, ri)
+        if min(r2, dot(rj, rj)) < (EARTH_RADIUS_KM + MIN_HEIGHT_KM) ** 2:
             return np.inf
         if abs(arc[2]) > 1.0:
             for m in range(3):
@@ -198,7 +199,7 @@ def join_pair(tracklets, i, j, first_km, state, work):
         if round_ < ROUNDS - 1:
             share = GRAVITY_SHARE * FASTER ** (round_ + 1)
             model_km += share * 0.5 * GM_KM3_S2 / r2 * dt * dt
-    if _dot(v, v) / 2.0 > GM_KM3_S2 / np.sqrt(r2):
+    if dot(v, v) / 2.0 > GM_KM3_S2 / np.sqrt(r2):
         return np.inf
     for m in range(3):
         state[m], state[3 + m] = ri[m], v[m]
@@ -208,7 +209,7 @@ def join_pair(tracklets, i, j, first_km, state, work):
 @borrowing_kernel
 def _oblateness(ri, rj, out):
     """Write the acceleration by the oblateness between two positions; return its scale [km/s^2]."""
-    r2 = _dot(ri, ri)
+    r2 = dot(ri, ri)
     scale = 1.5 * J2 * EARTH_RADIUS_KM**2 * GM_KM3_S2 / (r2 * r2)
     z = 0.5 * (ri[2] + rj[2])
     for m in range(3):
@@ -231,7 +232,7 @@ def _velocity(tracklets, i, j, a, b, v, N, right):
         k, rho = (i, a) if side == 0 else (j, b)
         for c in range(2):
             axis = tracklets.east[k] if c == 0 else tracklets.north[k]
-            value = _dot(axis, tracklets.v_km_s[k]) + rho * _dot(axis, tracklets.w[k])
+            value = dot(axis, tracklets.v_km_s[k]) + rho * dot(axis, tracklets.w[k])
             weight = 1.0 / (rho * rho * tracklets.cov[k, 2 + c, 2 + c] + 1e-12)
             for m in range(3):
                 right[m] += weight * axis[m] * value
@@ -373,12 +374,18 @@ def search(tracklets, packed, group, max_gap_s, first, last, pairs, states, stat
                 first_km = _start_km(p, OTHER_RANGES_KM[k - 1] if k else 0.0)
                 if not join_pair(tracklets, i, j, first_km, state, work) < GATE:
                     continue
-                if count < len(pairs):
-                    pairs[count, 0], pairs[count, 1] = i, j
-                    for m in range(6):
-                        states[count, m] = state[m]
-                count += 1
+                count = add_pair(i, j, state, count, pairs, states)
     return count
+
+
+@borrowing_kernel
+def add_pair(i, j, state, count, pairs, states):
+    """Write a pair and its orbit as number `count`, where there is room; return the next number."""
+    if count < len(pairs):
+        pairs[count, 0], pairs[count, 1] = i, j
+        for m in range(6):
+            states[count, m] = state[m]
+    return count + 1
 
 
 @borrowing_kernel
