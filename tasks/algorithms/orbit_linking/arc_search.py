@@ -23,11 +23,10 @@ BLOCK_S = 600.0  # length of a block: the orbits that begin in it are propagated
 # Farther apart [km, km/s] two orbits are not compared. Estimated: the orbit of two tracklets a
 # minute apart is off by a part of this an hour later, and neighbours in a plane are farther apart.
 NEAR_KM, NEAR_KM_S = 300.0, 0.3
+NEAR_SIGMA = 5.0  # of a tracklet's rates, beside `NEAR_KM_S`
 MIN_ROOM = 4096  # for pairs at first; if there are more, the search is repeated with more
-MAX_SINGLE = (
-    5000  # single tracklets that each end is compared with: bounds the time of a dense night
-)
-NEAR_SIGMA = 5.0  # and of the error of a tracklet's rates
+# Single tracklets that each end is compared with: bounds the time of a dense night.
+MAX_SINGLE = 5000
 
 
 class ArcEnds(NamedTuple):
@@ -48,6 +47,7 @@ class ArcEnds(NamedTuple):
 
 
 def no_ends(count: int) -> ArcEnds:
+    """Return ends that have no orbit yet."""
     return ArcEnds(
         np.full(count, -1), np.zeros(count), np.zeros(count), np.full((count, 6), np.nan)
     )
@@ -150,19 +150,22 @@ def near_tracklets(ends, tracklets, free, way, min_gap_s, max_gap_s, out):
     int
         Number of pairs. It may be larger than m: then the rest is not written.
     """
-    y, work, count, total = np.empty(6), np.empty((5, 42)), 0, len(free)
+    y, work, count = np.empty(6), np.empty((5, 42)), 0
+    time_s = tracklets.time_s[free]
     for n in range(len(ends.row)):
         for m in range(6):
             y[m] = ends.state[n, m]
-        now, compared = ends.epoch_s[n], 0
-        for at in range(total):
-            k = free[at] if way > 0 else free[total - 1 - at]
-            gap = way * (tracklets.time_s[k] - ends.time_s[n])
-            if gap < min_gap_s:
-                continue
-            if gap > max_gap_s or compared == MAX_SINGLE:
+        now = ends.epoch_s[n]
+        if way > 0:
+            first = np.searchsorted(time_s, ends.time_s[n] + min_gap_s)
+            room = len(free) - first
+        else:
+            room = np.searchsorted(time_s, ends.time_s[n] - min_gap_s, side="right")
+            first = room - 1
+        for step in range(min(room, MAX_SINGLE)):
+            k = free[first + way * step]
+            if way * (tracklets.time_s[k] - ends.time_s[n]) > max_gap_s:
                 break
-            compared += 1
             advance(y, tracklets.time_s[k] - now, STEP_S, work)
             now = tracklets.time_s[k]
             if _near(y, tracklets, k):
