@@ -382,21 +382,46 @@ def determine_orbit(
     )  # fmt: skip
     if n < MIN_DIRECTIONS:
         return failed
-    unknowns = np.concatenate([start, areas.mean])
-    shared = np.zeros((len(directions.prior), N_SHARED))
+    begin = np.concatenate([start, areas.mean]), np.zeros((len(directions.prior), N_SHARED))
+    given = directions, areas, around
+    near = _from_near(*begin, start_s, *given)
+    orbit = None if near is None else _of_all(*near, start_s, epoch_s, *given)
+    # The directions near an initial state between two tracklets are a part of one of them: the
+    # orbit that fits these may be far from that of both, which the initial state was made of.
+    return orbit or _of_all(*begin, start_s, epoch_s, *given) or failed
+
+
+def _from_near(
+    unknowns: Array, shared: Array, start_s: float, directions: ObjectDirections,
+    areas: AreaPrior, around: Surroundings,
+) -> tuple[Array, Array] | None:  # fmt: skip
+    """Return the unknowns, fitted to ever more directions around the initial state, but not all.
+
+    None if a fit fails.
+    """
     try:
         for rows in _windows(directions.time_s, start_s):
             near = part_of(directions, rows)
-            found = _converge(
-                unknowns, shared, start_s, near, np.ones(len(near.time_s), bool), areas, around
-            )
+            used = np.ones(len(near.time_s), bool)
+            found = _converge(unknowns, shared, start_s, near, used, areas, around)
             if found is None:
-                return failed
+                return None
             unknowns, shared = found[0].unknowns, found[0].shared
-        unknowns, _ = propagate_unknowns(unknowns, start_s, epoch_s, around)
-        return _without_outliers(unknowns, shared, epoch_s, directions, areas, around) or failed
     except ValueError:
-        return failed
+        return None
+    return unknowns, shared
+
+
+def _of_all(
+    unknowns: Array, shared: Array, start_s: float, epoch_s: float, directions: ObjectDirections,
+    areas: AreaPrior, around: Surroundings,
+) -> DeterminedOrbit | None:  # fmt: skip
+    """Return the fit to all directions; None if it fails."""
+    try:
+        unknowns, _ = propagate_unknowns(unknowns, start_s, epoch_s, around)
+        return _without_outliers(unknowns, shared, epoch_s, directions, areas, around)
+    except ValueError:
+        return None
 
 
 def neglected(r_km: Array, arc_s: float) -> Array:
