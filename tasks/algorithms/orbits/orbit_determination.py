@@ -382,13 +382,16 @@ def determine_orbit(
     )  # fmt: skip
     if n < MIN_DIRECTIONS:
         return failed
-    begin = np.concatenate([start, areas.mean]), np.zeros((len(directions.prior), N_SHARED))
-    given = directions, areas, around
-    near = _from_near(*begin, start_s, *given)
-    orbit = None if near is None else _of_all(*near, start_s, epoch_s, *given)
+    unknowns, shared = np.concatenate([start, areas.mean]), failed.shared
+
+    def of_all(unknowns: Array, shared: Array) -> DeterminedOrbit | None:
+        return _of_all(unknowns, shared, start_s, epoch_s, directions, areas, around)
+
+    near = _from_near(unknowns, shared, start_s, directions, areas, around)
+    orbit = None if near is None else of_all(*near)
     # The directions near an initial state between two tracklets are a part of one of them: the
     # orbit that fits these may be far from that of both, which the initial state was made of.
-    return orbit or _of_all(*begin, start_s, epoch_s, *given) or failed
+    return orbit or of_all(unknowns, shared) or failed
 
 
 def _from_near(
