@@ -299,10 +299,7 @@ def later_pairs(
     """Return all pairs (p, 2) of `search_heights`, and their orbits (p, 6)."""
     edges = height_edges()
     possible = np.empty((len(edges) - 1, len(group)), np.bool_)
-    if max_gap_s > MIN_GAP_S:
-        at_heights(tracklets, edges, possible)
-    else:
-        possible[:] = False
+    at_heights(tracklets, edges, possible)
     return with_room(
         len(group),
         lambda *out: search_heights(tracklets, packed, group, possible, edges, max_gap_s, *out),

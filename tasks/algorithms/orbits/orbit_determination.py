@@ -385,13 +385,19 @@ def determine_orbit(
     unknowns, shared = np.concatenate([start, areas.mean]), failed.shared
 
     def of_all(unknowns: Array, shared: Array) -> DeterminedOrbit | None:
-        return _of_all(unknowns, shared, start_s, epoch_s, directions, areas, around)
+        try:
+            unknowns, _ = propagate_unknowns(unknowns, start_s, epoch_s, around)
+            return _without_outliers(unknowns, shared, epoch_s, directions, areas, around)
+        except ValueError:
+            return None
 
     near = _from_near(unknowns, shared, start_s, directions, areas, around)
     orbit = None if near is None else of_all(*near)
     # The directions near an initial state between two tracklets are a part of one of them: the
     # orbit that fits these may be far from that of both, which the initial state was made of.
-    return orbit or of_all(unknowns, shared) or failed
+    if orbit is None and (near is None or near[0] is not unknowns):
+        orbit = of_all(unknowns, shared)
+    return orbit or failed
 
 
 def _from_near(
@@ -413,18 +419,6 @@ def _from_near(
     except ValueError:
         return None
     return unknowns, shared
-
-
-def _of_all(
-    unknowns: Array, shared: Array, start_s: float, epoch_s: float, directions: ObjectDirections,
-    areas: AreaPrior, around: Surroundings,
-) -> DeterminedOrbit | None:  # fmt: skip
-    """Return the fit to all directions; None if it fails."""
-    try:
-        unknowns, _ = propagate_unknowns(unknowns, start_s, epoch_s, around)
-        return _without_outliers(unknowns, shared, epoch_s, directions, areas, around)
-    except ValueError:
-        return None
 
 
 def neglected(r_km: Array, arc_s: float) -> Array:
