@@ -280,6 +280,7 @@ FRAME_INDEX = schema(
         column("log", pa.int32(), doc="Index of the log in the run, in the order of names."),
         column("piece", pa.int32(), doc="Index of the piece of the log."),
         column("row", I64, doc="Row in the exposures of the piece."),
+        column("shift", I64, doc="To add to the frame's number: the sensor's counter restarted."),
     ],
 )
 

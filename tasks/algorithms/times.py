@@ -159,6 +159,56 @@ def nearest_frame(epoch_ns: Nanoseconds, time_ns: Nanoseconds) -> npt.NDArray[np
 
 # Order and duplicates
 
+# Share of a sensor's frames at which its counter may restart. Two sensors with one id seem to
+# restart at each second frame.
+MAX_RESTARTS = 0.1
+LARGEST_NUMBER = 2**62
+
+
+def restart_shifts(time_ns: Integers, frame_number: Integers) -> Integers:
+    """Return what to add to the frame numbers of a sensor so that none comes again, (n,).
+
+    A counter restarts with its sensor, or begins again at its end. Then the numbers go on from the
+    highest one before. It has restarted where the number falls to one that was used since the last
+    restart, and counts up from there: a single wrong number does not count.
+
+    Parameters
+    ----------
+    time_ns, frame_number : (n,) int
+        In any order; a frame may be there several times.
+    """
+    order = np.lexsort((frame_number, time_ns))
+    t, f = time_ns[order], frame_number[order]
+    first = np.ones(len(f), np.bool_)
+    first[1:] = (t[1:] != t[:-1]) | (f[1:] != f[:-1])
+    number = f[first]
+    falls = np.flatnonzero(number[1:-1] < number[:-2]) + 1
+    falls = falls[(number[falls + 1] > number[falls]) & (number[falls + 1] <= number[falls - 1])]
+    starts, shifts = [0], [0]
+    if len(falls) <= max(1, MAX_RESTARTS * len(number)):
+        used = _used_before(number)
+        for fall in falls.tolist():
+            if used[fall] < starts[-1]:
+                continue
+            highest = int(number[starts[-1] : fall].max()) + shifts[-1]
+            if highest > LARGEST_NUMBER:
+                break
+            starts.append(fall)
+            shifts.append(highest + 1 - int(number[fall]))
+    of_number = np.repeat(shifts, np.diff(starts, append=len(number)))
+    out = np.zeros(len(f), np.int64)
+    out[order] = of_number[np.cumsum(first) - 1]
+    return out
+
+
+def _used_before(number: Integers) -> Integers:
+    """Return the last index before each at which the same number stands; -1: none."""
+    by_number = np.argsort(number, kind="stable")
+    same = number[by_number[1:]] == number[by_number[:-1]]
+    used = np.full(len(number), -1)
+    used[by_number[1:][same]] = by_number[:-1][same]
+    return used
+
 
 def order_frames(
     sensor: Integers, time_ns: Integers, frame_number: Integers
@@ -176,8 +226,8 @@ def order_frames(
         Indices that sort the frames.
     verdict : (n,) int8
         In that order. KEEP: the frame is kept. DUPLICATE_FRAME: same sensor, number and time as
-        a kept frame. DUPLICATE_NUMBER: same number as an earlier kept frame, at another time (a
-        counter that restarted, or two sensors with one id). DUPLICATE_TIME: same time as a kept
+        a kept frame. DUPLICATE_NUMBER: same number as an earlier kept frame, at another time (as of
+        two sensors with one id). DUPLICATE_TIME: same time as a kept
         frame with a lower number: a sensor makes one exposure at a time.
     """
     order = np.lexsort((np.arange(len(sensor)), frame_number, time_ns, sensor))

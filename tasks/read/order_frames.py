@@ -34,6 +34,7 @@ from epipole.tasks.algorithms.times import (
     KEEP,
     order_frames,
     order_states,
+    restart_shifts,
 )
 from epipole.tasks.common.batches import Batch, in_batches
 from epipole.tasks.common.stage_tasks import stage_task
@@ -193,9 +194,19 @@ def frames_between(folder: ReadFolder, sensor: int, start_ns: int, end_ns: int) 
         tables.append(exposures.take(row[rows]))
         rank.append(rows)
     frames = concat(EXPOSURES, tables)
-    if len(tables) < 2:
+    if len(tables) > 1:
+        frames = frames.take(np.argsort(np.concatenate(rank), kind="stable"))
+    return _numbered_on(frames, array(index, "shift"))
+
+
+def _numbered_on(frames: pa.Table, shift: Indices) -> pa.Table:
+    """Return EXPOSURES with numbers that go on where the counter restarted."""
+    if not shift.any():
         return frames
-    return frames.take(np.argsort(np.concatenate(rank), kind="stable"))
+    number = pa.array(array(frames, "frame_number") + shift)
+    return frames.set_column(
+        frames.schema.get_field_index("frame_number"), EXPOSURES.field("frame_number"), number
+    )
 
 
 def states_between(folder: ReadFolder, sensor: int, start_ns: int, end_ns: int) -> pa.Table:
@@ -222,7 +233,9 @@ def _order_sensor(
 ) -> _OrderedSensor:
     keys, strays = _without_strays(_keys(folder, sensor), sensor)
     time_ns, number = array(keys, "time"), array(keys, "frame_number")
-    order, verdict = order_frames(np.zeros(len(time_ns), np.int64), time_ns, number)
+    shift = restart_shifts(time_ns, number)
+    order, verdict = order_frames(np.zeros(len(time_ns), np.int64), time_ns, number + shift)
+    keys = keys.append_column("shift", pa.array(shift))
     index = conform(FRAME_INDEX, keys.take(order[verdict == KEEP]))
     states, repeats = _sorted_states(folder, sensor, settings)
     write_part(folder.sensor(sensor.number), READ_SENSOR, {"index": index, "states": states})
@@ -230,6 +243,8 @@ def _order_sensor(
         frames_left_out(keys.take(order[verdict == code]), reason)
         for code, reason in _DUPLICATES.items()
     ]
+    renumbered = keys.take(order[(verdict == KEEP) & (shift[order] != 0)])
+    duplicates.append(frames_left_out(renumbered, Reason.RESTARTED_COUNTER))
     return _OrderedSensor(by_span(array(index, "time")), [stray_rejects(strays), *duplicates,
                                                            repeats])  # fmt: skip
 

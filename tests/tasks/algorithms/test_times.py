@@ -25,6 +25,7 @@ from epipole.tasks.algorithms.times import (
     nearest_frame,
     order_frames,
     order_states,
+    restart_shifts,
     tai_minus_utc_s,
     tt_julian_date,
     utc_julian_date,
@@ -209,3 +210,39 @@ def test_states_of_one_time_count_once_and_the_first_given_is_kept():
     order, repeats = order_states(np.array([1, 0, 1, 1]), np.array([5, 9, 5, 4]))
     assert list(order) == [1, 3, 0, 2]
     assert list(repeats) == [False, False, False, True]
+
+
+@pytest.mark.parametrize(
+    ("number", "shift"),
+    [
+        ([], []),
+        ([5], [0]),
+        ([0, 1, 2, 0, 1, 2, 3], [0, 0, 0, 3, 3, 3, 3]),  # a restart
+        ([6, 7, 0, 1, 2, 6, 7, 8], [0] * 5 + [0] * 3),  # lower numbers, used later
+        ([0, 1, 2, 3, 1, 5, 6], [0] * 7),  # one wrong number
+        ([0, 1, 2, 9, 3, 4, 5], [0] * 7),  # one wrong number, no other comes again
+        ([0, 0, 1, 1, 2, 2, 3, 3], [0] * 8),  # two sensors with one id
+        ([2**62 + 1, 2**62 + 2, 2**62 + 1, 2**62 + 2], [0] * 4),  # no room for more
+    ],
+)
+def test_numbers_go_on_where_a_counter_restarted(number, shift):
+    number = np.repeat(number, 3).astype(np.int64)  # in three logs
+    time_ns = np.repeat(np.arange(len(shift)), 3)
+    mixed = np.random.default_rng(1).permutation(len(number))
+    found = np.empty(len(number), np.int64)
+    found[mixed] = restart_shifts(time_ns[mixed], number[mixed])
+    np.testing.assert_array_equal(found, np.repeat(shift, 3).astype(np.int64))
+
+
+def test_a_counter_of_eight_bits_never_gives_a_number_twice():
+    number = np.arange(5000) % 256
+    number[2500:] = np.arange(2500) % 256  # restarted once more
+    numbered = number + restart_shifts(np.arange(5000), number)
+    assert (np.diff(numbered) == 1).all()
+
+
+def test_numbers_of_two_sensors_with_one_id_do_not_change():
+    rng = np.random.default_rng(2)
+    number = np.stack([np.arange(400), np.arange(400) + 57], axis=1)
+    time_ns = 10 * np.arange(400)[:, None] + rng.integers(0, 10, 2)
+    assert not restart_shifts(time_ns.ravel(), number.ravel()).any()

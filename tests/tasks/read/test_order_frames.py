@@ -116,12 +116,27 @@ def test_overlapping_logs_give_each_frame_and_state_once_in_any_order(tmp_path):
     assert log.sources == other.sources
 
 
-def test_repeated_numbers_of_a_restarted_counter_are_one_reject(tmp_path):
+def test_after_a_restart_of_the_counter_numbers_go_on(tmp_path):
     a = write(tmp_path / "a.mcap", "s", [(0, 0), (1, 1), (2, 2), (10, 0), (11, 1), (12, 7)])
     log = read(a)
-    assert array(log.exposures, "frame_number").tolist() == [0, 1, 2, 7]
-    assert rows(log) == [("duplicate_number", "s", "a.mcap", 2)]
+    assert array(log.exposures, "frame_number").tolist() == [0, 1, 2, 3, 4, 10]
+    assert rows(log) == [("restarted_counter", "s", "a.mcap", 3)]
     assert array(log.rejects, "time").tolist() == [START_NS + 10 * SECOND_NS]
+
+
+def test_logs_that_each_count_from_zero_are_one_sensor(tmp_path):
+    a = write(tmp_path / "a.mcap", "s", [(i, i) for i in range(5)])
+    b = write(tmp_path / "b.mcap", "s", [(i + 5, i) for i in range(5)])
+    log = read(b, a)
+    assert array(log.exposures, "frame_number").tolist() == list(range(10))
+    assert rows(log) == [("restarted_counter", "s", "b.mcap", 5)]
+
+
+def test_a_single_repeated_number_is_one_reject(tmp_path):
+    a = write(tmp_path / "a.mcap", "s", [(0, 0), (1, 1), (2, 1), (3, 3)])
+    log = read(a)
+    assert array(log.exposures, "frame_number").tolist() == [0, 1, 3]
+    assert rows(log) == [("duplicate_number", "s", "a.mcap", 1)]
 
 
 def test_the_same_log_under_two_names_is_read_once(tmp_path):
