@@ -226,7 +226,7 @@ def _visible_volume(views: Views, sensors: Indices, shells: Array, farthest_km: 
     if len(known) < 2:
         return np.full((2, len(shells)), np.nan)
     others = np.setdiff1d(np.flatnonzero(ready[:, m]), known)
-    cameras = [np.ascontiguousarray(views.camera[part, m]) for part in (known, others)]
+    camera = np.ascontiguousarray(views.camera[known, m])
     sampled = known[np.arange(min(len(known), SAMPLED)) * len(known) // min(len(known), SAMPLED)]
     side = int(np.sqrt(SIGHTS / len(sampled)))
     volume = np.zeros((2, len(shells)))
@@ -236,7 +236,9 @@ def _visible_volume(views: Views, sensors: Indices, shells: Array, farthest_km: 
         overlap = _overlap(views, known[known != s], m, r_km, u, farthest_km)
         rho, edges = _steps(r_km, u, shells, *overlap)
         x = r_km + rho[..., None] * u[:, None]
-        count, theirs = _seen_by(*cameras, x.reshape(-1, 3)).T.reshape(2, *rho.shape)
+        near = others[_may_see(views, others, m, x[overlap[0] < overlap[1]])]
+        theirs_too = np.ascontiguousarray(views.camera[near, m])
+        count, theirs = _seen_by(camera, theirs_too, x.reshape(-1, 3)).T.reshape(2, *rho.shape)
         # A point is met from each sensor that sees it.
         part = (
             np.diff(edges**3, axis=1) / 3 * cell_sr[:, None] / np.maximum(count, 1) * (count >= 2)
@@ -279,6 +281,26 @@ def _overlap(
     lowest = np.where(crosses, low, farthest_km).min(axis=1)
     highest = np.where(crosses, high, 0.0).max(axis=1)
     return np.minimum(lowest, highest), highest
+
+
+def _may_see(views: Views, sensors: Indices, m: int, x_km: Array) -> Flags:
+    """Return which sensors' fields may have any of the points x_km in them, (s,).
+
+    Of thousands of sensors, nearly all look past the few that share a field. Each field's cone is
+    compared with the sphere around the points. Without points all are false.
+    """
+    if not x_km.size:
+        return np.zeros(len(sensors), np.bool_)
+    low, high = x_km.min(axis=(0, 1)), x_km.max(axis=(0, 1))
+    toward = (low + high) / 2 - views.position_km[sensors, m]
+    distance = np.linalg.norm(toward, axis=1)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        off_axis = np.arccos(
+            np.clip(np.sum(toward * views.attitude[sensors, m, 2], axis=1) / distance, -1, 1)
+        )
+        radius = np.arcsin(np.linalg.norm(high - low) / 2 / distance)  # NaN: within the sphere
+    corner = np.arctan(np.linalg.norm(views.half_field[sensors], axis=1))
+    return np.asarray(~(off_axis > corner + radius))
 
 
 @kernel

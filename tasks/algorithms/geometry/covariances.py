@@ -17,6 +17,7 @@ from epipole.tasks.algorithms.geometry.camera import (
     unproject,
 )
 from epipole.tasks.algorithms.geometry.directions import skew, tangent_basis
+from epipole.tasks.algorithms.kernels import kernel
 
 Array = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int64]
@@ -135,22 +136,43 @@ def image_derivatives(camera: Camera, u: Array) -> tuple[Array, Array]:
         By the numbers of `OPTICS`.
     """
     x, y = u[:, 0] / u[:, 2], u[:, 1] / u[:, 2]
-    stretch = np.stack(slopes(camera, x, y), axis=1).reshape(-1, 2, 2)
-    turned = np.empty((len(x), 2, 3))  # undistorted position by the rotation vector
-    turned[:, 0] = np.stack([-x * y, 1 + x * x, -y], axis=1)
-    turned[:, 1] = np.stack([-1 - y * y, x * y, x], axis=1)
+    from_middle = np.stack(project(camera, u), axis=1) - np.array([camera.cx_px, camera.cy_px])
     f = np.array([camera.fx_px, camera.fy_px])
-    px, py = project(camera, u)
-    x, y = ideal_position(camera, x, y)
-    r2, xy2 = x * x + y * y, 2 * x * y
-    moved = np.zeros((len(x), 2, 9))
-    moved[:, 0, 0], moved[:, 1, 1] = (px - camera.cx_px) / f[0], (py - camera.cy_px) / f[1]
-    moved[:, 0, 2] = moved[:, 1, 3] = 1.0
-    for column, power in ((4, 1), (5, 2), (8, 3)):
-        moved[:, 0, column], moved[:, 1, column] = f[0] * x * r2**power, f[1] * y * r2**power
-    moved[:, 0, 6], moved[:, 1, 6] = f[0] * xy2, f[1] * (r2 + 2 * y * y)
-    moved[:, 0, 7], moved[:, 1, 7] = f[0] * (r2 + 2 * x * x), f[1] * xy2
-    return f[:, None] * (stretch @ turned), moved
+    stretch, ideal = np.stack(slopes(camera, x, y)), np.stack(ideal_position(camera, x, y))
+    return _derivatives(np.stack([x, y]), stretch, ideal, from_middle, f)
+
+
+@kernel
+def _derivatives(xy, stretch, ideal, from_middle, f):
+    """Return `image_derivatives` from what the camera makes of each direction.
+
+    `xy` (2, n) are directions (x, y, 1), `stretch` (4, n) the derivatives of their distorted by
+    their undistorted positions, `ideal` (2, n) the latter [focal lengths], `from_middle` (n, 2) the
+    images about the principal point [px], f (2,) the focal lengths [px].
+    """
+    n = xy.shape[1]
+    by_turn, by_optics = np.empty((n, 2, 3)), np.zeros((n, 2, 9))
+    for i in range(n):
+        x, y = xy[0, i], xy[1, i]
+        for a in range(2):
+            across, down = f[a] * stretch[2 * a, i], f[a] * stretch[2 * a + 1, i]
+            by_turn[i, a, 0] = -across * x * y - down * (1 + y * y)
+            by_turn[i, a, 1] = across * (1 + x * x) + down * x * y
+            by_turn[i, a, 2] = down * x - across * y
+        x, y = ideal[0, i], ideal[1, i]
+        r2 = x * x + y * y
+        for a, along in enumerate((x, y)):
+            moved = by_optics[i, a]
+            moved[a] = from_middle[i, a] / f[a]
+            moved[2 + a] = 1.0
+            moved[4], moved[5], moved[8] = (
+                along * r2 * f[a],
+                along * r2**2 * f[a],
+                along * r2**3 * f[a],
+            )
+            moved[6 + a] = 2 * x * y * f[a]
+            moved[7 - a] = (r2 + 2 * along * along) * f[a]
+    return by_turn, by_optics
 
 
 def shared_attitude_covariance(

@@ -16,6 +16,7 @@ import numpy.typing as npt
 
 from epipole.tasks.algorithms.geometry.camera import Camera, project
 from epipole.tasks.algorithms.geometry.covariances import OPTICS, image_derivatives
+from epipole.tasks.algorithms.kernels import kernel
 
 Array = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int64]
@@ -339,24 +340,17 @@ def _fit(
         r, J_turn, J_optics = _linearise(camera, images.xy, u)
         sigma = max(sigma_px, _robust_sigma(r, used))  # far from the optimum all weights are 1
         weight = np.minimum(1.0, HUBER * sigma / np.maximum(np.abs(r), 1e-12)) / sigma**2
-        J_optics = J_optics @ (scale[:, None] * basis)
-        weighted = weight[..., None] * J_turn
-        A = _sums_by_frame(weighted, J_turn, images.starts)
+        J_optics = (J_optics.reshape(-1, 9) @ (scale[:, None] * basis)).reshape(len(r), 2, k)
+        A, b, B, C, c = _normal_equations(J_turn, J_optics, weight, r, images.starts)
         # Also with all stars of a frame at one position.
         A += 1e-9 * np.trace(A, axis1=1, axis2=2)[:, None, None] * np.eye(3)
-        b = np.add.reduceat(np.einsum("nai,na->ni", weighted, r), images.starts)
         turn = np.linalg.solve(A, b[..., None])[..., 0]
-        B = _sums_by_frame(weighted, J_optics, images.starts)
         # Rotations that compensate a change of the optics.
         lever = np.asarray(np.linalg.solve(A, B), np.float64)
-        rows = J_optics.reshape(2 * len(r), k)
-        C = (rows * weight.reshape(-1, 1)).T @ rows + np.eye(k)
-        C -= np.einsum("fki,fkj->ij", B, lever)
-        pull: Array = weight * r
-        c = rows.T @ pull.reshape(-1)
+        C += np.eye(k) - np.tensordot(B, lever, axes=((0, 1), (0, 1)))
         c -= basis.T @ ((_values(camera) - nominal) / scale)
         cov = np.asarray(np.linalg.inv(C), np.float64)
-        step = cov @ (c - np.einsum("fki,fk->i", B, turn))
+        step = cov @ (c - np.tensordot(turn, B, axes=2))
         turn = turn - lever @ step
         camera = _moved(camera, (basis @ step) * scale)
         u = u + np.cross(turn[images.of_frame], u)
@@ -364,16 +358,41 @@ def _fit(
         still = np.abs(step / np.sqrt(np.diag(cov))).max(initial=0.0) < SETTLED
         if still and np.abs(turn).max() < SETTLED * sigma * camera.pixel_rad:
             break
-    score = _scores(J_turn, J_optics, pull, lever, images.of_frame)
+    score = _scores(J_turn, J_optics, weight * r, lever, images.of_frame)
     r = _residuals(camera, images.xy, u)
     moved = basis.T @ ((_values(camera) - nominal) / scale)
     return _Fit(camera, u, moved, cov, r, sigma_px or _robust_sigma(r, used), score)
 
 
-def _sums_by_frame(a: Array, b: Array, starts: Indices) -> Array:
-    """Return the sums of a' b (f, k, m) over the images of each frame; a (n, 2, k), b (n, 2, m)."""
-    products = a[:, 0, :, None] * b[:, 0, None, :] + a[:, 1, :, None] * b[:, 1, None, :]
-    return np.asarray(np.add.reduceat(products, starts))
+@kernel
+def _normal_equations(J_turn, J_optics, weight, r, starts):
+    """Return the sums over the star images that the normal equations of the fit consist of.
+
+    J_turn (n, 2, 3) [px/rad] and J_optics (n, 2, k) are derivatives of the images by the rotation
+    of their frame and by the free parameters, `weight` (n, 2) is 1/variance [px^-2], r (n, 2) are
+    residuals [px], starts (f,) the first image of each frame. Result: J_turn' J_turn (f, 3, 3),
+    J_turn' r (f, 3) and J_turn' J_optics (f, 3, k) of each frame, J_optics' J_optics (k, k) and
+    J_optics' r (k,) of all, weighted.
+    """
+    k, ends = J_optics.shape[2], np.append(starts[1:], len(r))
+    A, b = np.zeros((len(starts), 3, 3)), np.zeros((len(starts), 3))
+    B, C, c = np.zeros((len(starts), 3, k)), np.zeros((k, k)), np.zeros(k)
+    for i in range(len(starts)):
+        for n in range(starts[i], ends[i]):
+            for axis in range(2):
+                turn, optics = J_turn[n, axis], J_optics[n, axis]
+                w, pull = weight[n, axis], weight[n, axis] * r[n, axis]
+                for p in range(3):
+                    b[i, p] += turn[p] * pull
+                    for q in range(3):
+                        A[i, p, q] += w * turn[p] * turn[q]
+                    for q in range(k):
+                        B[i, p, q] += w * turn[p] * optics[q]
+                for p in range(k):
+                    c[p] += optics[p] * pull
+                    for q in range(k):
+                        C[p, q] += w * optics[p] * optics[q]
+    return A, b, B, C, c
 
 
 def _scores(J_turn: Array, J_optics: Array, pull: Array, lever: Array, frame: Indices) -> Array:

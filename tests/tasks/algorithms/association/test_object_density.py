@@ -61,6 +61,21 @@ def test_the_volume_that_many_sensors_share_is_known_from_a_few_of_them():
         )
 
 
+def test_no_sensor_that_may_see_a_point_is_passed_over():
+    rng, passed = np.random.default_rng(3), 0
+    for seed in range(20):
+        scene = ten_tracklets(seed, n_sensors=12, n_objects=1, n_strays=0)
+        samples, sensors = scene.samples, np.arange(12)
+        toward = unit(rng.normal(size=3))
+        middle = samples.sensor_km[0, 0] + rng.uniform(0, 3e4) * toward
+        x = middle + rng.normal(size=(200, 3)) * 10 ** rng.uniform(0, 3)
+        may_see = chance_module._may_see(scene.space.views, sensors, 0, x[:, None])
+        assert may_see[[sees(samples, s, x).any() for s in sensors]].all()
+        passed += (~may_see).sum()
+    assert passed > 60  # of 240
+    assert not chance_module._may_see(scene.space.views, sensors, 0, x[:0, None]).any()
+
+
 def sees(samples, s, x):
     """Return which of the points a sensor sees, as `ten_tracklets.in_field` for many points."""
     r, R = samples.sensor_km[s, 0], samples.R_sensor_from_icrs[s, 0]
