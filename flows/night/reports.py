@@ -47,11 +47,14 @@ def with_reports(summary: Summary, staged: Mapping[str, Path], write: bool) -> S
             broken = new_broken_logs(summary.dataset, night)
             looks[night] = [*broken, *(look.sentence for look in needs_look(facts))]
             if write:
-                text, extract = _page_and_extract(facts)
+                try:
+                    text, extract = _page_and_extract(facts)
+                except ReportError as error:  # for this reason none is written: looks go on
+                    LOGGER.info("no report is written: %s", error)
+                    write = False
+                    continue
                 write_beside(summary.dataset, REPORTS, f"{night}.html", text.encode())
                 extracts.append(extract)
-    except ReportError as error:
-        LOGGER.info("no report is written: %s", error)
     except Exception as error:  # of drawing, of the store, of anything: the night is done
         LOGGER.warning("the report could not be made: %s", line_of(error))
     return dataclasses.replace(summary, extracts=tuple(extracts), looks=looks)

@@ -351,7 +351,9 @@ def _link(parts: NightParts, settings: Settings) -> tuple[NightParts, pa.Table]:
 
     See `link_tracklets`.
     """
-    future = link_tracklets.submit(tracklets_of_night(parts), parts.night, settings.linking)
+    taken = sorted({name for of_span in parts.names.values() for name in of_span.values()})
+    tracklets = tracklets_of_night(parts)
+    future = link_tracklets.submit(tracklets, parts.night, taken, settings.linking)
     links: OrbitLinks
     (links,) = results(Stage.NAME, [future])
     if links.tracklets.num_rows:

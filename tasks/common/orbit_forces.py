@@ -3,9 +3,11 @@
 import re
 
 import numpy as np
+import numpy.typing as npt
 
 from epipole.io.catalogues.earth_orientation import read_earth_orientation
 from epipole.schemas.spans import DAY_NS
+from epipole.tasks.algorithms.constants import EARTH_RADIUS_KM, GM_KM3_S2
 from epipole.tasks.algorithms.orbits.forces import Surroundings, surroundings
 
 # Names in `orbits.forces`; the last two are followed by the area over mass.
@@ -17,6 +19,18 @@ RADIATION_KM = 1000.0
 # Area over mass in sunlight, coefficient included: of satellites 0.01 to 0.05 m^2/kg. In the air
 # twice that is usual, and the static density may be off by a factor of three.
 SUNLIT_AREA, AIR_AREA = (0.02, 0.02), (0.03, 0.06)  # mean and sigma [m^2/kg]
+
+
+def is_sunlit(state: npt.NDArray[np.float64]) -> bool:
+    """Return whether radiation moves a satellite more than air does: it stays high.
+
+    state : (6,) float
+        Position and velocity [km, km/s], in any frame that does not turn.
+    """
+    momentum2 = float(np.sum(np.cross(state[:3], state[3:]) ** 2))
+    energy = float(state[3:] @ state[3:]) / 2 - GM_KM3_S2 / float(np.linalg.norm(state[:3]))
+    eccentricity = np.sqrt(max(1 + 2 * energy * momentum2 / GM_KM3_S2**2, 0.0))
+    return bool(momentum2 / GM_KM3_S2 / (1 + eccentricity) > EARTH_RADIUS_KM + RADIATION_KM)
 
 
 def surroundings_of(night: str, ahead_ns: int = 0) -> Surroundings:

@@ -17,7 +17,7 @@ from epipole.io.datasets.night_tables import read_columns
 from epipole.schemas.bridge import stack_covariance, to_polars
 from epipole.schemas.columns import POSITION, STATE_AXES, VELOCITY
 from epipole.schemas.tables import ORBITS, STATES
-from epipole.tasks.algorithms.constants import DAY_S, EARTH_RADIUS_KM, GM_KM3_S2, SECOND_NS
+from epipole.tasks.algorithms.constants import DAY_S, GM_KM3_S2, SECOND_NS
 from epipole.tasks.algorithms.orbits.forces import N_UNKNOWNS
 from epipole.tasks.algorithms.orbits.object_linking import ObservedMotions, link_by_motion
 from epipole.tasks.algorithms.orbits.trajectories import (
@@ -27,9 +27,9 @@ from epipole.tasks.algorithms.orbits.trajectories import (
 )
 from epipole.tasks.common.orbit_forces import (
     AIR_AREA,
-    RADIATION_KM,
     SUNLIT_AREA,
     areas_in,
+    is_sunlit,
     noon_ns,
     surroundings_of,
 )
@@ -178,8 +178,7 @@ def _areas(state: Array, forces: str) -> tuple[list[float], list[float]]:
     A short arc does not show them, but hours do: then they are as usual.
     """
     named = areas_in(forces)
-    is_high = np.linalg.norm(state[:3]) > EARTH_RADIUS_KM + RADIATION_KM
-    usual = [SUNLIT_AREA, (0.0, 0.0)] if is_high else [(0.0, 0.0), AIR_AREA]
+    usual = [SUNLIT_AREA, (0.0, 0.0)] if is_sunlit(state) else [(0.0, 0.0), AIR_AREA]
     means = [area or mean for area, (mean, _) in zip(named, usual, strict=True)]
     return means, [sigma for _, sigma in usual]
 

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pyarrow.compute as pc
 
-from epipole.io.datasets.night_tables import read_columns, write_table
+from epipole.io.datasets.night_tables import read_columns, rewrite_table
 from epipole.schemas.bridge import concat
 from epipole.schemas.stages import Stage
 from epipole.schemas.tables import CHECKS
@@ -66,7 +66,9 @@ def judge_times(folder: Path, known: ElementsOfNight) -> None:
     if found.verdict == WRONG:
         LOGGER.warning("all sensors: %s", sentence_of(found))
     rows = checks_table({name: [found] for name in sensors})
-    write_table(folder, "checks", [concat(CHECKS, [checks, rows])])
+    # A task that was killed as it wrote starts again: its rows are there once.
+    others = checks.filter(pc.not_equal(checks["check"], UTC_TIMES))
+    rewrite_table(folder, "checks", [concat(CHECKS, [others, rows])])
 
 
 def finding_of(offset: TimeOffset, n_tracklets: int) -> Finding:

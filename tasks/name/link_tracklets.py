@@ -5,6 +5,8 @@ one object if one orbit explains their attributables, and chance does not. They 
 has positions, or become an object without.
 """
 
+import re
+from collections.abc import Collection
 from typing import NamedTuple
 
 import numpy as np
@@ -50,7 +52,9 @@ NO_LINKS = OrbitLinks(LINKED_TRACKLETS.empty_table(), LINKED_ORBITS.empty_table(
 
 
 @stage_task(Stage.NAME, "linked tracklets")
-def link_tracklets(tracklets: pa.Table, night: str, settings: LinkingSettings) -> OrbitLinks:
+def link_tracklets(
+    tracklets: pa.Table, night: str, names: Collection[str], settings: LinkingSettings
+) -> OrbitLinks:
     """Return the objects of tracklets that are joined by an orbit.
 
     Parameters
@@ -60,6 +64,8 @@ def link_tracklets(tracklets: pa.Table, night: str, settings: LinkingSettings) -
     night
         UTC date. New objects get its date and the numbers after those of the others, in order of
         first appearance.
+    names
+        Ids of the objects of the run, also of those that no tracklet has.
     """
     if not settings.enabled:
         return NO_LINKS
@@ -70,7 +76,7 @@ def link_tracklets(tracklets: pa.Table, night: str, settings: LinkingSettings) -
         attributables_of(rows), rows["known"].to_numpy(), max_gap_s=settings.max_gap_s,
         log_odds=settings.log_odds, max_orbit_gap_s=settings.max_orbit_gap_s,
     )  # fmt: skip
-    links = _name(rows.with_columns(label=pl.Series(found.label)), night)
+    links = _name(rows.with_columns(label=pl.Series(found.label)), night, names)
     return links._replace(orbits=_orbits(rows, found, links.tracklets))
 
 
@@ -82,23 +88,23 @@ def _candidates(rows: pl.DataFrame) -> pl.DataFrame:
     return rows.with_columns(known=known_numbers(rows))
 
 
-def _name(rows: pl.DataFrame, night: str) -> OrbitLinks:
+def _name(rows: pl.DataFrame, night: str, names: Collection[str]) -> OrbitLinks:
     """Return the links of labelled tracklets: the earliest object of a label gives its id."""
     joined = rows.filter(pl.col("known").n_unique().over("label") > 1)
     renamed = _one_object(joined)
-    names = joined.with_columns(pl.col("object_id").replace(renamed).alias("id"))
-    names = names.with_columns(pl.col("id").drop_nulls().first().over("label"))
+    named = joined.with_columns(pl.col("object_id").replace(renamed).alias("id"))
+    named = named.with_columns(pl.col("id").drop_nulls().first().over("label"))
     in_night = (pl.col("epoch").dt.date().cast(pl.String) == night).any().over("label")
-    unnamed = names.filter(pl.col("id").is_null() & in_night)
+    unnamed = named.filter(pl.col("id").is_null() & in_night)
     date = night.replace("-", "")
-    taken = rows["object_id"].drop_nulls().str.extract(f"^{date}-(\\d+)$").drop_nulls()
-    next_number = max((int(number) for number in taken.unique()), default=0) + 1
+    taken = [re.fullmatch(f"{date}-(\\d+)", name) for name in names]
+    next_number = max((int(number[1]) for number in taken if number), default=0) + 1
     new = {
         label: f"{date}-{next_number + k:05d}"
         for k, label in enumerate(unnamed["label"].unique(maintain_order=True).to_list())
     }
     by_label = pl.col("label").replace_strict(new, default=None, return_dtype=pl.String)
-    linked = names.filter(pl.col("object_id").is_null())
+    linked = named.filter(pl.col("object_id").is_null())
     linked = linked.select("tracklet_id", pl.coalesce("id", by_label).alias("object_id"))
     return NO_LINKS._replace(
         tracklets=from_polars(LINKED_TRACKLETS, linked.drop_nulls()), renamed=renamed

@@ -31,7 +31,8 @@ AXES = ("along", "across")
 class SensorResidual:
     """Observed minus predicted position of a sensor's known objects, at their distance [km].
 
-    Mean and scatter are over the objects, each by the mean of its detections.
+    Mean and scatter are over the objects, each by the mean of its detections. One object has no
+    scatter: NaN.
     """
 
     sensor_id: str
@@ -43,10 +44,14 @@ class SensorResidual:
 
     def __str__(self) -> str:
         """Return a line of the summary."""
-        return (
-            f"{self.sensor_id}: along {self.along_km:+.2f} +- {self.along_scatter_km:.2f} km, "
-            f"across {self.across_km:+.2f} +- {self.across_scatter_km:.2f} km"
+        axes = (
+            f"{axis} {mean:+.2f}" + (f" +- {scatter:.2f} km" if self.objects > 1 else " km")
+            for axis, mean, scatter in (
+                ("along", self.along_km, self.along_scatter_km),
+                ("across", self.across_km, self.across_scatter_km),
+            )
         )
+        return f"{self.sensor_id}: {', '.join(axes)}"
 
 
 def sensor_residuals(folder: Path, known: Mapping[str, ElementSet]) -> list[SensorResidual]:
@@ -97,7 +102,8 @@ def _with_residuals(seen: pl.DataFrame, elements: ElementSet) -> pl.DataFrame:
 
 
 def _of_sensor(sensor_id: str, means: Array) -> SensorResidual:
-    (along, across), (along_scatter, across_scatter) = means.mean(axis=0), means.std(axis=0)
+    along, across = means.mean(axis=0)
+    along_scatter, across_scatter = means.std(axis=0) if len(means) > 1 else (np.nan, np.nan)
     return SensorResidual(
         sensor_id, len(means), float(along), float(along_scatter), float(across),
         float(across_scatter),

@@ -105,7 +105,7 @@ def _least(value: Callable[[int], float], first: int, last: int) -> int:
     """Return the number for which a function is least: of some at first, then between them."""
     known: dict[int, float] = {}
     tried = np.unique(np.linspace(first, last, COARSE + 1).astype(int)).tolist()
-    step = max((last - first) // COARSE, 1)
+    step = max(-(-(last - first) // COARSE), 1)
     while True:
         for number in tried:
             if number not in known and first <= number <= last:

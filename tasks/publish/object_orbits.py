@@ -13,8 +13,6 @@ from epipole.schemas.rejects import Reason
 from epipole.schemas.work_tables import SHARED_OBSERVATIONS
 from epipole.tasks.algorithms.constants import (
     ARCSEC,
-    EARTH_RADIUS_KM,
-    GM_KM3_S2,
     SECOND_NS,
 )
 from epipole.tasks.algorithms.geometry.directions import east_north, unit_from_radec
@@ -34,8 +32,8 @@ from epipole.tasks.common.orbit_forces import (
     DRAG,
     GRAVITY,
     RADIATION,
-    RADIATION_KM,
     SUNLIT_AREA,
+    is_sunlit,
 )
 from epipole.tasks.publish.sensor_errors import SensorSums, summed_equations
 
@@ -222,10 +220,7 @@ def _with_neglected(fitted: FittedOrbit, arc_s: float) -> FittedOrbit:
 def _possible_forces(state: Array, arc_s: float) -> list[tuple[str, AreaPrior]]:
     """Return the forces that an orbit may have beside gravity, each with its prior."""
     none = (0.0, 0.0)
-    momentum2 = float(np.sum(np.cross(state[:3], state[3:]) ** 2))
-    energy = float(state[3:] @ state[3:]) / 2 - GM_KM3_S2 / float(np.linalg.norm(state[:3]))
-    e = np.sqrt(max(1 + 2 * energy * momentum2 / GM_KM3_S2**2, 0.0))
-    if momentum2 / GM_KM3_S2 / (1 + e) > EARTH_RADIUS_KM + RADIATION_KM:
+    if is_sunlit(state):
         return [(RADIATION, _prior(SUNLIT_AREA, none))]
     if arc_s > SHORTEST_DRAG_S:
         return [("", _prior(none, none)), (DRAG, _prior(none, AIR_AREA))]

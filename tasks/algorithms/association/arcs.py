@@ -213,13 +213,15 @@ def _unrelated_odds(views, chance, fragments, first, at):
     """
     s, i, last = views.sensor[fragments[0]], fragments[0], fragments[0]
     J, h, part = np.zeros((4, 4)), np.zeros(4), np.empty(11)
-    first_seen, last_seen = _ends(views, i, first)
+    first_seen, last_seen = -1, -1
     for k in fragments:
         begin, end = _ends(views, k, first)
-        if begin < first_seen:
+        if begin >= 0 and (first_seen < 0 or begin < first_seen):
             first_seen, i = begin, k
         if end > last_seen:
             last_seen, last = end, k
+    if first_seen < 0:
+        return 0.0  # seen before `first` only, as the orbit is not
     variance, chi2, b = 1.0, 0.0, np.zeros(3)
     if first_seen < last_seen:
         variance = _scatter(views, chance, i, last, first_seen, last_seen, b)

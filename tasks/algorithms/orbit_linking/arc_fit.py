@@ -288,8 +288,19 @@ def fit_component(tracklets, members, epoch_s, component, state, work):
 
 
 @kernel
+def sort_rows(values):
+    """Sort a few integers in place."""
+    for k in range(1, len(values)):
+        value, at = values[k], k
+        while at > 0 and values[at - 1] > value:
+            values[at] = values[at - 1]
+            at -= 1
+        values[at] = value
+
+
+@kernel
 def fit_arc(tracklets, members, epoch_s, state, work):
-    """Fit one orbit, and return its log evidence over all components, and the best chi-square.
+    """Fit one orbit; return its log evidence over all components, and chi-square of the likeliest.
 
     `state` (6,) becomes the orbit of the likelier component. NaN if no fit converges.
     """

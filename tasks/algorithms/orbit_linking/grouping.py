@@ -19,7 +19,13 @@ import numpy.typing as npt
 
 from epipole.tasks.algorithms.earth_gravity import advance
 from epipole.tasks.algorithms.kernels import kernel
-from epipole.tasks.algorithms.orbit_linking.arc_fit import STEP_S, Tracklets, fit_arc, fit_work
+from epipole.tasks.algorithms.orbit_linking.arc_fit import (
+    STEP_S,
+    Tracklets,
+    fit_arc,
+    fit_work,
+    sort_rows,
+)
 from epipole.tasks.algorithms.orbit_linking.arc_search import (
     ArcEnds,
     all_near_tracklets,
@@ -30,6 +36,9 @@ from epipole.tasks.algorithms.orbit_linking.arc_search import (
 )
 from epipole.tasks.algorithms.orbit_linking.height_search import later_pairs
 from epipole.tasks.algorithms.orbit_linking.pair_search import (
+    GATE,
+    dot,
+    join_pair,
     may_be_one,
     near_pairs,
     packed_tracklets,
@@ -46,13 +55,13 @@ NEAR_S = 900.0
 # more of them do not change the answer, nor does half, and an orbit over hours needs more forces.
 MAX_MEMBERS = 8
 MAX_ARC_S = 1800.0  # the propagation is right to 5 m in this time, see `arc_fit.STEP_S`
-# Members that support another are this near in time [s]: as far as pairs may be, else nothing holds
-# both sides of a long gap against each other, and two objects of one shell may stay joined.
+# Members that support another are this near in time [s]: as near as the longest gap of a pair. With
+# less, both sides of a long gap are never compared, and two objects of a shell may stay joined.
 SUPPORT_S = 2400.0
 # Chi-square by which the joint fit may be worse than both alone: quantile 1 - 1e-5 for 2, 4 and 6
 # degrees of freedom (tracklet and tracklet, set and tracklet, set and set).
 GATES = (23.03, 28.47, 33.38)
-# Of chi-square about its mean: a set whose orbit fits worse is not one object. With half of it,
+# Gate of a set's chi-square, in sigmas above its degrees of freedom. With half of it,
 # bench_orbit_linking finds 1 to 2 of 100 objects less.
 SET_SIGMA = 5.0
 KEPT_LOG_ODDS = -8.0  # of a pair: a third tracklet may yet show that it is one object
@@ -93,10 +102,10 @@ class LinkedTracklets(NamedTuple):
     """Which tracklets are one object.
 
     label : (n,) int
-        Number of the object: the first row of its tracklets.
+        Row of one of the object's tracklets, the same for all of them.
     epoch_s, state : (n,), (n, 6) float
-        For the first row of an object that was joined: the orbit [km, km/s] of its last join, GCRF,
-        and its epoch. NaN for other rows.
+        In that row, if the object was joined: the orbit [km, km/s] of its last join, GCRF, and its
+        epoch. Known objects of several tracklets may have one too. NaN in other rows.
     """
 
     label: Indices
@@ -153,6 +162,7 @@ def link_tracklets(
     _confirm(tracklets, alone, _stays(known), log_odds, sets, is_loose, epoch_s, state)
     _join_all(tracklets, alone, edges, log_odds, False, sets, is_loose, epoch_s, state)
     if max_orbit_gap_s > 0.0:
+        _begin_known(tracklets, alone, sets, epoch_s, state)
         far = _far_edges(tracklets, alone, sets, epoch_s, state, max_orbit_gap_s)
         _join_all(tracklets, alone, far, log_odds, False, sets, is_loose, epoch_s, state)
     return LinkedTracklets(sets.root, epoch_s, state)
@@ -316,6 +326,32 @@ def _join_known(known, first, sets):
 
 
 @kernel
+def _begin_known(tracklets, alone, sets, epoch_s, states):
+    """Write an orbit of each known set that nothing joined: that of the pair that fits it best."""
+    work, rows = fit_work(), np.empty(MAX_MEMBERS, np.int64)
+    begin, scratch = np.empty(6), np.empty((8, 3))
+    for root in range(len(epoch_s)):
+        if sets.root[root] != root or sets.size[root] < 2 or np.isfinite(epoch_s[root]):
+            continue
+        at_s, best = tracklets.time_s[root], -np.inf
+        count = _nearest(tracklets, sets, root, at_s, MAX_ARC_S, NONE, rows)
+        sort_rows(rows[:count])
+        for a in range(count):
+            for b in range(a + 1, count):
+                i, j = rows[a], rows[b]
+                first_km = np.sqrt(dot(tracklets.r_km[i], tracklets.r_km[i]))
+                if not join_pair(tracklets, i, j, first_km, begin, scratch) < GATE:
+                    continue
+                evidence, _, _, epoch, state = _sum(
+                    tracklets, alone, rows[:count], tracklets.time_s[i], begin, work
+                )
+                if evidence > best:
+                    best, epoch_s[root] = evidence, epoch
+                    for m in range(6):
+                        states[root, m] = state[m]
+
+
+@kernel
 def _nearest(tracklets, sets, root, at_s, reach_s, but, out):
     """Write at most MAX_MEMBERS members of a set that are nearest in time; return their number.
 
@@ -360,29 +396,18 @@ def _compatible(tracklets, sets, a, b):
 def _sum(tracklets, alone, members, start_s, start, work):
     """Return log evidence, chi-square and degrees of freedom of a set, and its epoch and orbit.
 
-    NaN if the orbit cannot be fitted, or does not fit.
+    The evidence is NaN if no orbit converges.
     """
     state = start.copy()
     if len(members) == 1:
         return alone[members[0]], 0.0, 0, start_s, state
-    _sort(members)
+    sort_rows(members)
     epoch = 0.0
     for k in members:
         epoch += tracklets.time_s[k] / len(members)
     advance(state, epoch - start_s, STEP_S, work.steps)
     evidence, chi2 = fit_arc(tracklets, members, epoch, state, work)
     return evidence, chi2, 4 * len(members) - 6, epoch, state
-
-
-@kernel
-def _sort(values):
-    """Sort a few integers in place."""
-    for k in range(1, len(values)):
-        value, at = values[k], k
-        while at > 0 and values[at - 1] > value:
-            values[at] = values[at - 1]
-            at -= 1
-        values[at] = value
 
 
 @kernel
@@ -507,7 +532,7 @@ def _release(sets, root, k):
 def _confirm(tracklets, alone, stays, log_odds, sets, is_loose, epoch_s, states):
     """Release the tracklets of loosely joined sets that the others of the set do not support.
 
-    Two tracklets alone do not stay: what they lack for a join is a rival less.
+    A loose pair is always released: if its odds suffice, a rival prevented the join.
     """
     work = fit_work()
     for label in range(len(stays)):

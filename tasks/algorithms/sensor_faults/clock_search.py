@@ -121,7 +121,7 @@ def _best_supported(pairs: Indices, offset: Array, sigma: Array, n_false: int) -
     `n_false` is the number of false pairs at right angles, within the same interval of offsets.
     """
     n = len(offset)
-    best: tuple[float, float] | None = None
+    best: tuple[float, int, float] | None = None
     for k in range(n):
         window = SAME_SIGMA * np.hypot(sigma, sigma[k])
         near = np.flatnonzero(np.abs(offset - offset[k]) < window)
@@ -132,12 +132,12 @@ def _best_supported(pairs: Indices, offset: Array, sigma: Array, n_false: int) -
         with np.errstate(divide="ignore"):
             # One less: the pair in the middle agrees by definition.
             odds = float(np.log(pdtrc(agree - 2, expected)))
-        if best is None or odds < best[0]:
+        if best is None or (odds, -agree) < best[:2]:  # of hundreds the odds are -inf
             weight = 1 / sigma[near] ** 2
-            best = odds, float(np.sum(weight * offset[near]) / np.sum(weight))
+            best = odds, -agree, float(np.sum(weight * offset[near]) / np.sum(weight))
     if best is None or best[0] + np.log(n) > np.log(MAX_FALSE_ALARM):
         return None
-    return best[1]
+    return best[2]
 
 
 def _one_to_one(pairs: Indices, offset: Array, sigma: Array, best: float) -> list[int]:

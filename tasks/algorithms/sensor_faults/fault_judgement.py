@@ -173,7 +173,7 @@ def judge_sensors(
             attitude_sigma_rad > 0,
             bool((lines.sensor >= 0).all()),
         )
-        wrong = np.array([(s, CLOCK) in explained.faults for s in range(n_sensors)])
+        wrong = np.array([(s, CLOCK) in explained.faults for s in range(n_sensors)], bool)
         wrong |= (ALL, SHARED) in explained.faults
         unknowns = model.estimate(explained.faults)[0]
         step_s = unknowns[::PER_SENSOR][wrong] * PRIOR_S

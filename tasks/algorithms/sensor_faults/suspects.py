@@ -53,7 +53,7 @@ def judge_many_sensors(
     n_sensors = len(position_sigma_km)
     if n_sensors <= MAX_TOGETHER:
         return judge_sensors(lines, position_sigma_km, attitude_sigma_rad, guess_s)
-    doubt = _doubt_of_most(lines, position_sigma_km, attitude_sigma_rad)
+    doubt = _doubt_of_most(lines, position_sigma_km, attitude_sigma_rad, guess_s)
     prior_sigma = prior_sigmas(position_sigma_km, attitude_sigma_rad)
     found = _nothing_known(n_sensors)._replace(doubt=doubt)
     if np.isfinite(doubt.shared_s):
@@ -66,10 +66,10 @@ def judge_many_sensors(
         )
         if not faulty.any():
             _store_offsets(found, equations, guess_s, prior_sigma)
-        suspicion = np.where(
-            faulty, -np.inf, _suspicion(equations, guess_s, prior_sigma, attitude_sigma_rad)
-        )
-        together = np.sort(np.argsort(-suspicion, kind="stable")[:MAX_TOGETHER])
+        suspicion = _suspicion(equations, guess_s, prior_sigma, attitude_sigma_rad)
+        suspects = np.argsort(-suspicion, kind="stable")
+        # Without those at fault: they have no lines left, and would be judged sound.
+        together = np.sort(suspects[~faulty[suspects]][:MAX_TOGETHER])
         judged = judge_sensors(
             _with_sound_others(left, together, prior_sigma),
             position_sigma_km[together],
@@ -83,7 +83,9 @@ def judge_many_sensors(
     return found
 
 
-def _doubt_of_most(lines: Lines, position_sigma_km: Array, attitude_sigma_rad: Array) -> Doubt:
+def _doubt_of_most(
+    lines: Lines, position_sigma_km: Array, attitude_sigma_rad: Array, guess_s: Array
+) -> Doubt:
     """Return what is wrong without a name, by the sensors with most lines alone."""
     count = np.bincount(lines.sensor, minlength=len(position_sigma_km))
     most = np.sort(np.argsort(-count, kind="stable")[:MAX_TOGETHER])
@@ -91,7 +93,9 @@ def _doubt_of_most(lines: Lines, position_sigma_km: Array, attitude_sigma_rad: A
     others[most] = False
     among = _of_other_sensors(lines, others)
     among = among._replace(sensor=np.searchsorted(most, among.sensor))
-    return judge_sensors(among, position_sigma_km[most], attitude_sigma_rad[most]).doubt
+    return judge_sensors(
+        among, position_sigma_km[most], attitude_sigma_rad[most], guess_s[most]
+    ).doubt
 
 
 class _Equations(NamedTuple):

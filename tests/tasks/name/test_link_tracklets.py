@@ -1,5 +1,7 @@
 """Link tracklets: the task gives ids to what the orbits join, and merges objects only in turn."""
 
+from collections.abc import Sequence
+
 import numpy as np
 import polars as pl
 import pyarrow as pa
@@ -17,8 +19,13 @@ def scene():
     return orbit_tracklets(11, 6, 4, 60.0)
 
 
-def linked(rows: pa.Table, settings: LinkingSettings = LinkingSettings()) -> OrbitLinks:  # noqa: B008
-    return link_tracklets.fn(rows, NIGHT, settings)
+def linked(
+    rows: pa.Table,
+    settings: LinkingSettings = LinkingSettings(),  # noqa: B008
+    taken: Sequence[str] = (),
+) -> OrbitLinks:
+    names = [*filter(None, rows["object_id"].unique().to_pylist()), *taken]
+    return link_tracklets.fn(rows, NIGHT, names, settings)
 
 
 def ids(links: OrbitLinks) -> dict[str, str]:
@@ -69,6 +76,11 @@ def test_an_object_that_is_seen_again_has_its_earlier_id(scene):
     named[b], named[c] = named[c], named[b]
     links = linked(rows_of(scene, object_id=named, outcome=outcome))
     assert not links.renamed
+
+
+def test_a_new_object_has_no_id_of_one_without_tracklets(scene):
+    found = ids(linked(rows_of(scene), taken=["20260530-00041", "20260529-00099"]))
+    assert min(found.values()) == "20260530-00042"
 
 
 @pytest.mark.parametrize("outcome", ["ambiguous", "disagrees", "sensor_left_out"])

@@ -20,7 +20,7 @@ from epipole.tasks.algorithms.orbits.illumination import illumination
 from epipole.tasks.algorithms.orbits.orbital_elements import elements_of
 from epipole.tasks.algorithms.orbits.trajectories import propagate_unknowns
 from epipole.tasks.common.orbit_forces import surroundings_of
-from epipole.tasks.publish import orbits
+from epipole.tasks.publish import manoeuvres, orbits
 from epipole.tasks.publish.fitted_observations import complete_observations
 from epipole.tasks.publish.orbits import fit_orbits, write_orbits
 from epipole.tasks.publish.share_out import share_out
@@ -320,3 +320,9 @@ def test_a_night_without_objects_has_no_orbits(tmp_path):
 def test_large_nights_are_shared_out(monkeypatch, tmp_path, rows):
     monkeypatch.setattr(orbits.NightReader, "count", lambda *_: rows)
     assert orbits.orbit_shares(tmp_path, NIGHT) == (2 if rows > 300_000 else 1)
+
+
+def test_the_cut_that_explains_most_is_found_wherever_it_is():
+    for span in range(60):
+        for best in range(span + 1):
+            assert manoeuvres._least(lambda k, best=best: float(abs(k - best)), 0, span) == best

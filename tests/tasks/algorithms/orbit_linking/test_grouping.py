@@ -149,6 +149,21 @@ def test_a_single_tracklet_joins_an_orbit_hours_away(first):
     assert not any(len(np.unique(apart[number == k])) == 1 for k in range(40))
 
 
+def test_a_single_tracklet_joins_a_known_object_hours_before():
+    scene = orbit_tracklets(13, 20, 4, 200.0, rate_arcsec_s=0.3, pause_s=6000.0)
+    order = np.argsort(scene.object, kind="stable").reshape(20, 4)
+    kept = np.sort(order[:, :3].ravel())
+    seen = Tracklets(*(column[kept] for column in scene.tracklets))
+    number = scene.object[kept]
+    known = np.full(len(kept), NONE)
+    known[np.isin(kept, order[:, :2])] = number[np.isin(kept, order[:, :2])]
+    given = {"max_gap_s": 900.0, "log_odds": 7.0, "max_orbit_gap_s": 10_800.0}
+    for objects in (known, np.full(len(kept), NONE)):
+        label = link_tracklets(seen, objects, **given).label
+        assert wrong(label, number) == 0
+        assert sum(len(np.unique(label[number == k])) == 1 for k in range(20)) >= 15
+
+
 def test_no_tracklets_no_groups():
     scene = orbit_tracklets(7, 1, 1, 1.0)
     empty = Tracklets(*(column[:0] for column in scene.tracklets))

@@ -45,6 +45,14 @@ def test_the_faults_of_many_are_those_that_all_together_have():
     assert abs(many.offset_s[3] - 0.3) < 4 * many.sigma_s[3]
 
 
+@pytest.mark.parametrize("more", [1, 2, 3])
+def test_faults_that_were_found_stay_where_few_other_sensors_are_left(more):
+    n = MAX_TOGETHER + more
+    found = judged(lines_of_many(2, n, 150, late_s={3: 0.8, 7: 0.8, 11: 0.8}), n)
+    assert faults(found) == {3: CLOCK, 7: CLOCK, 11: CLOCK}
+    assert np.isfinite(found.offset_s).all()
+
+
 def test_two_of_many_of_which_one_is_wrong_disagree_both():
     lines = lines_of_many(4, 8, 400, off_km={1: 8.0})
     # These two see objects with each other alone.
