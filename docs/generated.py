@@ -68,11 +68,17 @@ MADE_BY = {
         "pairs",
         "positions",
         "states",
-        "orbits",
-        "sensor_errors",
     ),
     Stage.NAME: ("identifications",),
-    Stage.PUBLISH: ("observations", "objects", "sources", "nights", "rejects"),
+    Stage.PUBLISH: (
+        "observations",
+        "orbits",
+        "sensor_errors",
+        "objects",
+        "sources",
+        "nights",
+        "rejects",
+    ),
 }
 
 TUTORIAL = "docs/first_night.md"

@@ -172,6 +172,13 @@ class Reason(StrEnum):
         Stage.READ,
         "Another frame of the sensor has the same number.",
     )
+    RESTARTED_COUNTER = (
+        "restarted_counter",
+        Stage.READ,
+        "The sensor's counter of frames restarted; the frame is used, numbered on from the highest "
+        "number before.",
+        Trait.HARMLESS,
+    )
     DUPLICATE_TIME = "duplicate_time", Stage.READ, "Another frame of the sensor has the same time."
     # Of a state.
     UNKNOWN_FRAME = (
@@ -234,8 +241,8 @@ class Reason(StrEnum):
     BAD_DISTORTION = (
         "bad_distortion",
         Stage.READ,
-        "The calibration's D has not 4 or 5 finite numbers (4 of a fisheye), or one that is out of "
-        "bounds.",
+        "The calibration's D is not empty and has not 4 or 5 finite numbers (4 of a fisheye), or "
+        "one that is out of bounds.",
         Trait.INVALID_CALIBRATION,
     )
     BAD_LINE_TIME = (
@@ -326,18 +333,18 @@ class Reason(StrEnum):
     )
     MANOEUVRE = (
         "manoeuvre",
-        Stage.SOLVE,
+        Stage.PUBLISH,
         "The object changed its orbit at this time; its observations before are not in its orbit.",
     )
     ORBIT_MISFIT = (
         "orbit_misfit",
-        Stage.SOLVE,
+        Stage.PUBLISH,
         "The chi-square of an object's orbit does not fit its degrees of freedom: its observations "
         "are of more than one object, or it changed its orbit more than once.",
     )
     NO_ORBIT = (
         "no_orbit",
-        Stage.SOLVE,
+        Stage.PUBLISH,
         "No orbit is found for an object: it has too few observations, or the fit does not "
         "converge.",
     )
@@ -479,7 +486,7 @@ class NameStatus(Declared):
     """What is known of an object's name."""
 
     KNOWN = "known", "It is one satellite of the catalogue."
-    AMBIGUOUS = "ambiguous", "It may be one of several satellites, or none; it has no name."
+    AMBIGUOUS = "ambiguous", "It may be one of several satellites, or none: `name` lists them."
     UNKNOWN = "unknown", "It is not in the catalogue, or there is no catalogue."
 
 

@@ -57,5 +57,5 @@ class Stage(Declared):
     )
     PUBLISH = (
         "publish",
-        "Writes the tables of each night and puts them in place at once.",
+        "Fits the orbits, writes the tables of each night and puts them in place at once.",
     )
