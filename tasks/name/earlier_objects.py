@@ -68,7 +68,8 @@ def recognise_objects(
     objects
         Ids of the objects to recognise. Ids that an earlier night knows already are skipped.
     earlier_h
-        Longest time between the last detection of an earlier object and the first one [hours].
+        Longest time from the last detection of an earlier object to the first of a new one
+        [hours].
     log_odds
         Minimum log odds; see `link_by_motion` for when a link is refused.
     """

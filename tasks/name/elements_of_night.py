@@ -1,4 +1,4 @@
-"""Elements of a night: one usable set for each object of a catalogue, and what it says of it."""
+"""Element sets of a night: the best one of each object of a catalogue, and its names."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -68,7 +68,7 @@ class CatalogueNames(NamedTuple):
 def names_of(
     status: str, sets: Sequence[ElementSet], best: int, rows: Sequence[int]
 ) -> CatalogueNames:
-    """Return what the catalogue says of something that may be some of its objects.
+    """Return the columns of the catalogue for an object or a tracklet.
 
     Parameters
     ----------

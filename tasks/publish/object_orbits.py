@@ -73,7 +73,7 @@ def both(rotation: Array) -> Array:
 
 
 class FittedOrbit(NamedTuple):
-    """An orbit at its epoch [s], with the names of its forces."""
+    """An orbit at its epoch [s] after the noon of the night, with the names of its forces."""
 
     orbit: DeterminedOrbit
     epoch_s: float
@@ -89,8 +89,9 @@ class ObservedObjects(NamedTuple):
     """The observations of some objects: those of object k are ``offsets[k]:offsets[k + 1]``.
 
     `views` has them as directions, their sensors numbered over all objects and without a prior;
-    `tracklet` is from 0, -1 for none. `cov_shared` (n, 2) are the variances of the direction
-    [rad^2] and the position [km^2] that the sensor's directions share.
+    `time_ns` (n,) is UTC since 1970; `tracklet` (n,) is from 0, -1 for none. `cov_shared` (n, 2)
+    are the variances of the direction [rad^2] and the position [km^2] that the sensor's directions
+    share.
     """
 
     names: list[str]

@@ -28,7 +28,9 @@ PIECE_BYTES = 20_000  # so that a small log has several pieces
 
 # Rows of `rejects` that are about no lost message: the frame or state is used, or it is about the
 # file as a whole.
-KEPT = {Reason.BAD_EXPOSURE, Reason.BAD_ATTITUDE, Reason.VAGUE_ATTITUDE}
+KEPT = {
+    Reason.BAD_EXPOSURE, Reason.BAD_ATTITUDE, Reason.VAGUE_ATTITUDE, Reason.RESTARTED_COUNTER,
+}  # fmt: skip
 OF_FILE = {Reason.TRUNCATED, Reason.LOG_BEHIND_LOG, Reason.BAD_DATA_CHECKSUM}
 
 

@@ -25,7 +25,7 @@ SLACK_SIGMA = 3.0
 
 @kernel
 def _begin(views, x, seen_by, state):
-    """Write a first state at the first solved instant; return that instant.
+    """Write a first state at the first solved instant; return its index.
 
     It is the straight line through the points, corrected for gravity.
     """
@@ -116,10 +116,9 @@ def _ends(views, i, first):
 def _scatter(views, chance, i, last, first_seen, last_seen, b):
     """Write the drift from tracklet i to `last`, relative to their sensor's others.
 
-    Both are the same tracklet, or fragments of one track. The variance is returned.
-
-    The variance is at least half the square of the drift: a far outlier is rare by a power law,
-    not by a Gaussian's tail.
+    i and `last` are one tracklet, or the first and the last fragment of a track. Return the
+    variance of the drift: at least half the square of the drift, since a far outlier is rare by a
+    power law, not by a Gaussian's tail.
     """
     s, dt = views.sensor[i], views.time_s[last_seen] - views.time_s[first_seen]
     square, u = 0.0, np.empty(3)
@@ -136,8 +135,8 @@ def _velocity_prior(views, chance, members, first, state, prior, prior_mean):
     """Write mean and inverse covariance of the velocity's prior; return its log norm.
 
     Across the line of sight objects move like the tracklets of the sensor whose tracklets
-    differ most; the norm includes the density of the first state among these. Along the line of
-    sight they move as orbits allow.
+    differ most; the norm includes that sensor's density at the drift of the first state. Along the
+    line of sight they move as orbits allow.
     """
     radius = np.sqrt(state[0] ** 2 + state[1] ** 2 + state[2] ** 2)
     along = RADIAL_SHARE * np.sqrt(GM_KM3_S2 / radius)

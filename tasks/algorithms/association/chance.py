@@ -40,7 +40,7 @@ MIN_DETECTION, MAX_DETECTION = 0.05, 0.99
 SIGHTS = 200  # lines of sight that sample the fields of a set of sensors
 SAMPLED = 12  # sensors of a set whose fields are sampled
 STEPS = 24  # along a line of sight, in addition to the shells' edges
-# Two sets of sensors count as one if both have this share of the sensors in either.
+# Least share of common sensors, of those in either (Jaccard index), of sets that count as one.
 SAME_SENSORS = 0.8
 PRIOR_OBJECTS = 1.0  # weight of a prior on the number of objects, as a number of objects
 ROUNDS = 100  # maximum number of iterations of `revised_odds`; 50 were enough in all scenes tried
@@ -61,7 +61,8 @@ class Chance(NamedTuple):
     spread : (s,) float
         Spread of their rates, 1-sigma per axis [rad/s].
     objects_in_view, objects_km3 : float
-        Largest number of objects in view, and the same per km^3.
+        Assumed number of objects in a field: the median number of tracklets of a sensor; and the
+        same per km^3 of a field.
     detected : (s,) float
         Probability that a sensor detects an object in its field.
     """
@@ -104,8 +105,8 @@ def _spread(deviation: Array, weight: Array) -> float:
     """Return the spread of a sensor's rates [rad/s, 1-sigma per axis], from their deviations.
 
     Each counts by its share of the instants: the fragments of a track are one tracklet together.
-    The median uses up one rate: one tracklet gives no spread. The logarithm is the mean of that of
-    the sensor's tracklets and that of `USUAL_SPREAD`, which counts as one tracklet.
+    The logarithm of the spread is the weighted mean of the sensor's own, whose median costs one
+    degree of freedom, and that of `USUAL_SPREAD`, which weighs as one tracklet.
     """
     others = max(float(weight.sum()) - 1, 0.0)
     square = (np.sum(weight[:, None] * deviation**2) / 2 + MIN_SPREAD**2) / (others + 2)
@@ -198,7 +199,7 @@ class VisibleVolumes(NamedTuple):
     shared
         What two or more of the sensors see.
     exclusive
-        The part of it that exactly these sensors see, or almost, see `SAME_SENSORS`.
+        The part of it that only this set of sensors sees, or a similar one (`SAME_SENSORS`).
     """
 
     shared: Array

@@ -13,8 +13,9 @@ import numpy.typing as npt
 class Hypothesis:
     """Tracklets (`members`) that may be one object, grown from the two of `seed`.
 
-    `score` is the log-odds against unrelated tracklets. `x_km` (3,) is the point at the first
-    instant. `missed` (n,) are the sensors that have it in their field but no tracklet of it.
+    `score` is the log-odds against unrelated tracklets. `x_km` (3,) is the position [km] at the
+    first solved instant, GCRF. `missed` (n,) are the sensors that have it in their field but no
+    tracklet of it.
     """
 
     score: float

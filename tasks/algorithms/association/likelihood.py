@@ -59,11 +59,12 @@ Indices = npt.NDArray[np.int64]
 
 PRIOR_DETECTION = 0.9  # probability of detection before the data are known
 FEW_SENSORS = 6  # up to this number, every pair of sensors provides seeds
-# With more sensors: gate of seeds, as other pairs seed the objects that it rejects (with 1.25 the
-# odds change, with 5 nothing does); maximum expected number of objects without a seed; and log-odds
-# at which a group is accepted before the next pair seeds. Half and double of the last two make no
-# difference up to 32 sensors: they save time in crowds.
-SEED_SIGMA, MAX_UNSEEDED, CLEAR_LOG_ODDS = 2.5, 0.01, 15.0
+# With more sensors they save time in crowds. Gate of seeds: other pairs seed the objects that it
+# rejects. With 1.25 the odds change, with 5 nothing does.
+SEED_SIGMA = 2.5
+# Maximum expected number of objects without a seed, and log-odds at which a group is accepted
+# before the next pair seeds. Half and double make no difference up to 32 sensors.
+MAX_UNSEEDED, CLEAR_LOG_ODDS = 0.01, 15.0
 MIN_KEPT_LOG_ODDS = -3.0  # minimum log-odds of a hypothesis before the number of objects is known
 # Log-odds above which the number of objects cannot make a group doubtful: with 40 all scenes tried
 # have the same odds, with 10 a constellation of 32 sensors has others.
@@ -101,7 +102,8 @@ def associate_tracklets(
     min_log_odds
         Minimum log-odds (natural) of a group, against unrelated tracklets.
     ambiguity_log_odds
-        If the log-odds of two contradicting groups differ by less, neither is reported.
+        If the log-odds of two contradicting groups differ by less, they are rivals: only the
+        tracklets that both have are reported, the others are ambiguous.
     shells
         A weak prior on altitude. The share that the shells leave is spread evenly. Without
         shells the prior is uniform.

@@ -52,7 +52,7 @@ class WindowGroups:
         self._score = np.zeros(0)
 
     def enter(self, rows: Indices, tracklet: Indices, groups: Groups) -> None:
-        """Enter the groups of some tracklets for their items."""
+        """Enter the groups of tracklets (t,), in ascending order, for the items `rows` (r,)."""
         if not len(tracklet):
             return
         at = np.searchsorted(tracklet, self.items.tracklet[rows])

@@ -20,8 +20,8 @@ Array = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int64]
 
 BLOCK_S = 600.0  # length of a block: the orbits that begin in it are propagated to its middle
-# Farther apart [km, km/s] two orbits are not compared. Estimated: the orbit of two tracklets a
-# minute apart is off by a part of this an hour later, and neighbours in a plane are farther apart.
+# Largest distance of two orbits that are compared [km, km/s]. Estimated: an orbit from two
+# tracklets a minute apart errs by less after an hour; neighbours in a plane are farther apart.
 NEAR_KM, NEAR_KM_S = 300.0, 0.3
 NEAR_SIGMA = 5.0  # of a tracklet's rates, beside `NEAR_KM_S`
 MIN_ROOM = 4096  # for pairs at first; if there are more, the search is repeated with more

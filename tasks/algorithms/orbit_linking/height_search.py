@@ -44,13 +44,13 @@ NEARLY_CIRCULAR = 0.03
 # Shorter gaps are those of `pair_search`, which finds eccentric orbits too: it finds all pairs of
 # simulated constellations up to ten minutes apart, and a third of those of ten to fifteen.
 MIN_GAP_S = 300.0
-# Error of a circular orbit that is off in height and eccentricity, as a share of the way along it.
+# 1-sigma error of the circular model, as a share of the length of the arc.
 WAY_SHARE = 0.02
-# Error of the model in each of Newton's steps [km]: how far the step before may be from the end.
+# 1-sigma error of the model in each of Newton's steps [km]; it shrinks as they converge.
 # J2 comes in with the third.
 STEPS_KM = (300.0, 100.0, 30.0, 3.0)
 OBLATE_STEP = 2
-GATE = 60.0  # chi-square of 2 degrees of freedom, whose correlations are neglected
+GATE = 60.0  # chi-square, wider than for 2 degrees of freedom: correlations are neglected
 
 
 def height_edges() -> Array:
@@ -120,7 +120,7 @@ def at_heights(tracklets, edges, out):
 
 @borrowing_kernel
 def _predict(tracklets, i, j, a, q, dt, off, out):
-    """Write what tracklet j lacks of an orbit through tracklet i: out (10,).
+    """Write the residuals at tracklet j of an orbit through tracklet i: out (10,).
 
     The orbit has the range a [km] and range rate q [km/s] at i. `off` (2, 3) is what J2 adds to the
     position and the velocity. `out`: distance from the line of sight, east and north [km]; the same

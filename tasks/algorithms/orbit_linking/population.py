@@ -54,7 +54,7 @@ def prior_of(x, component, pulls):
 
     The pulls are the radial and horizontal velocity, minus a circular orbit's, over their sigma:
     their squares are the prior's chi-square. The density [1/(km^3 (km/s)^3)] is that where both
-    are zero. x [km, km/s], GCRF.
+    pulls are zero: the caller subtracts half their squares. x [km, km/s], GCRF.
     """
     r = np.sqrt(x[0] * x[0] + x[1] * x[1] + x[2] * x[2])
     v2 = x[3] * x[3] + x[4] * x[4] + x[5] * x[5]

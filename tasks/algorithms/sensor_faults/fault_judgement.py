@@ -9,8 +9,8 @@ Clock errors of sensors that look the same way cannot be separated, and a wrong 
 attitude may look like a wrong clock. So sets of faults of all sensors are compared by their
 evidence, with a penalty for each fault: most sensors are sound. A fault is declared if it is in all
 of the best sets. If these agree on the sensor but not on the kind of its fault, the sensor
-disagrees. If they do not agree on the sensor either, all that may be at fault disagree, provided
-that more sensors are left; else somebody is wrong, and nobody knows who (`Doubt`).
+disagrees. If they differ in the sensor too, all suspects disagree, as long as the sound sensors
+outnumber them. Otherwise no sensor is named (`Doubt`).
 
 An offset that all clocks share counts as one fault. It moves all sensors along their orbits.
 """
@@ -66,8 +66,8 @@ class Lines(NamedTuple):
     u : (n, 3) float
         Measured directions, aberration removed.
     cov : (n, 2, 2) float
-        Covariance of their independent errors on `tangent_basis(u)` [rad^2]; and of those that n
-        lines share, but not all of the sensor, times n.
+        Covariance on `tangent_basis(u)` [rad^2]: the independent errors, plus n times each error
+        that only n of the sensor's lines share.
     x_km, v_km_s : (n, 3) float
         Solved position and velocity of the object at the line's time, GCRF.
     r_km, v_sensor_km_s : (n, 3) float
@@ -85,13 +85,13 @@ class Lines(NamedTuple):
 
 
 class Doubt(NamedTuple):
-    """What is wrong with sensors of which none can be named.
+    """Faults that cannot be assigned to a sensor.
 
     undecided : bool
         Some sensors are at fault, and several sets of them explain the lines as well.
     spread_km, spread_log_odds : float
-        The likeliest error of an ephemeris, per axis, if all sensors have one; and its odds against
-        the stated errors. The odds are 0 if the fault of a sensor is declared.
+        1-sigma error of the ephemerides per axis, if all sensors have the same, and its log odds
+        against the stated errors; 0 if any fault is declared.
     shared_s, shared_sigma_s : float
         The offset that all clocks share against the states, and its 1-sigma error. NaN if no such
         offset is declared.
@@ -402,9 +402,10 @@ def _doubt(model: Model, explained: _Explanation, has_lines: Flags) -> Doubt:
 
 
 def shift_lines(lines: Lines, offset_s: Array) -> Lines:
-    """Return the lines moved to the reported times, for clocks with these offsets.
+    """Return the lines corrected for clock offsets, (s,).
 
-    A line has the object and the sensor at their positions `offset_s` earlier.
+    A line was measured `offset_s` before its time stamp. Only the relative position counts, so the
+    sensor alone is moved (`r_km`).
     """
     d = np.append(offset_s, 0.0)[lines.sensor][:, None]
     moved = (lines.v_km_s - lines.v_sensor_km_s) * d
