@@ -205,15 +205,20 @@ def _words(heading: str, words: Iterable[StrEnum]) -> str:
 
 
 def settings() -> str:
-    """Return a section for each group of settings: names, defaults, meanings."""
+    """Return a section for each group of settings: names, defaults, bounds, meanings."""
     sections = []
     for name, field in Settings.model_fields.items():
         group = type(field.default)
         rows = [
-            (f"`{key}`", _default(option.default), (option.description or "") + _choices(option))
+            (
+                f"`{key}`",
+                _default(option.default),
+                _bounds(option),
+                (option.description or "") + _choices(option),
+            )
             for key, option in group.model_fields.items()
         ]
-        table = _markdown(("setting", "default", "meaning"), rows)
+        table = _markdown(("setting", "default", "bounds", "meaning"), rows)
         sections.append(f"## {name}\n\n{group.__doc__}\n\n{table}")
     return "\n".join(sections)
 
@@ -235,6 +240,18 @@ def scene() -> str:
         doc = " ".join((group.__doc__ or "").split())
         sections.append(f"### {heading}\n\n{doc}\n\n{table}")
     return "\n".join(sections)
+
+
+def _bounds(option: FieldInfo) -> str:
+    """Return the least and the largest value that a setting may have."""
+    bounds = {
+        kind: f"{getattr(each, kind):g}"
+        for each in option.metadata
+        for kind in ("gt", "ge", "lt", "le")
+        if isinstance(getattr(each, kind, None), int | float)
+    }
+    words = {"gt": "above {}", "ge": "{}", "lt": "below {}", "le": "{}"}
+    return " to ".join(words[kind].format(bounds[kind]) for kind in words if kind in bounds)
 
 
 def _choices(option: FieldInfo) -> str:

@@ -171,16 +171,16 @@ class IdentificationSettings(Group):
         1e-5,
         gt=0,
         lt=1,
-        description="Accepted share of a sensor's frames that get a false attitude; of those "
-        "without stars, where these are half or more.",
+        description="Accepted share of false attitudes: of all frames of a sensor; if half or more "
+        "show no stars, of those.",
     )
     time_limit_s: float = Field(
         0.5,
         gt=0,
         le=3600,
-        description="Longest search for one frame, and ten times the longest on average over a "
-        "sensor's frames, in seconds of a reference machine: work is counted. Frames that are not "
-        "searched to the end for it have the status `search_limit`.",
+        description="Limit of the searches of one frame, in seconds of a reference machine: work "
+        "is counted. Averaged over a sensor's frames they may take a tenth of it. Frames that are "
+        "not searched to the end for it have the status `search_limit`.",
     )
     calibrate: Literal["use", "report", "off"] = Field(
         "use",
@@ -221,7 +221,8 @@ class TrackletSettings(Group):
         le=1000,
         description="Accepted number of false tracklets in a sequence of at most 24 frames (with "
         "the default `min_detections`): detections that are in no tracklet are followed again with "
-        "it. Every pair of detections counts as a test; 1 to 5 % of it are measured.",
+        "it. Every pair of detections counts as a test, so it is an upper bound: 1 to 5 % of it "
+        "was measured.",
     )
     max_detections: int = Field(
         500_000,
