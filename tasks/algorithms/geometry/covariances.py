@@ -165,11 +165,9 @@ def _derivatives(xy, stretch, ideal, from_middle, f):
             moved = by_optics[i, a]
             moved[a] = from_middle[i, a] / f[a]
             moved[2 + a] = 1.0
-            moved[4], moved[5], moved[8] = (
-                along * r2 * f[a],
-                along * r2**2 * f[a],
-                along * r2**3 * f[a],
-            )
+            moved[4] = along * r2 * f[a]
+            moved[5] = along * r2**2 * f[a]
+            moved[8] = along * r2**3 * f[a]
             moved[6 + a] = 2 * x * y * f[a]
             moved[7 - a] = (r2 + 2 * along * along) * f[a]
     return by_turn, by_optics

@@ -70,6 +70,8 @@ def judge_many_sensors(
         suspects = np.argsort(-suspicion, kind="stable")
         # Without those at fault: they have no lines left, and would be judged sound.
         together = np.sort(suspects[~faulty[suspects]][:MAX_TOGETHER])
+        if not len(together):
+            break
         judged = judge_sensors(
             _with_sound_others(left, together, prior_sigma),
             position_sigma_km[together],
