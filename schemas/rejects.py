@@ -479,7 +479,10 @@ class ObjectVerdict(Declared):
         "Nothing is known against it, but no orbit is found: it has too few observations, or the "
         "fit does not converge.",
     )
-    SOUND = "sound", "One orbit fits all observations of it."
+    SOUND = (
+        "sound",
+        "One orbit fits its observations; of its directions at most one in twenty was left out.",
+    )
 
 
 class NameStatus(Declared):
