@@ -126,7 +126,7 @@ def _fits_all(
 
 
 def _deciding(names: TrackletNames, rows: pl.DataFrame) -> Indices:
-    """Return, for each tracklet, the row with the clearest name of its object, else its own row."""
+    """Return, for each tracklet, the row with the clearest name of its object, or its row."""
     rank = pl.Series(names.status).replace_strict(
         [status.value for status in NameStatus], range(len(NameStatus)), return_dtype=pl.Int64
     )

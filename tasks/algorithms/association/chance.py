@@ -105,8 +105,8 @@ def _spread(deviation: Array, weight: Array) -> float:
     """Return the spread of a sensor's rates [rad/s, 1-sigma per axis], from their deviations.
 
     Each counts by its share of the instants: the fragments of a track are one tracklet together.
-    The logarithm of the spread is the weighted mean of the sensor's own, whose median costs one
-    degree of freedom, and that of `USUAL_SPREAD`, which weighs as one tracklet.
+    The logarithm of the spread is the weighted mean of that of the sensor's rates, whose median
+    costs one degree of freedom, and that of `USUAL_SPREAD`, which weighs as one tracklet.
     """
     others = max(float(weight.sum()) - 1, 0.0)
     square = (np.sum(weight[:, None] * deviation**2) / 2 + MIN_SPREAD**2) / (others + 2)

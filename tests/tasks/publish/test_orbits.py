@@ -132,8 +132,8 @@ def test_an_arc_of_two_objects_is_a_reject(tmp_path):
     written(tmp_path, [seen, wrong], [state("a", GEO)])
     rows, rejects = made(tmp_path)
     assert rows.num_rows == 0
-    assert rejects["reason"].to_pylist() == ["no_position", "orbit_misfit"]
-    assert rejects["stage"].to_pylist() == ["solve", "solve"]
+    assert rejects["reason"].to_pylist() == ["orbit_misfit", "no_position"]
+    assert rejects["stage"].to_pylist() == ["publish", "solve"]
     # A task that runs again adds nothing.
     assert made(tmp_path)[1].equals(rejects)
 
