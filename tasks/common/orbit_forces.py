@@ -7,8 +7,9 @@ import numpy.typing as npt
 
 from epipole.io.catalogues.earth_orientation import read_earth_orientation
 from epipole.schemas.spans import DAY_NS
-from epipole.tasks.algorithms.constants import EARTH_RADIUS_KM, GM_KM3_S2
+from epipole.tasks.algorithms.constants import EARTH_RADIUS_KM
 from epipole.tasks.algorithms.orbits.forces import Surroundings, surroundings
+from epipole.tasks.algorithms.orbits.trajectories import perigee_km
 
 # Names in `orbits.forces`; the last two are followed by the area over mass.
 GRAVITY, RADIATION, DRAG = "GM J2-J4 C22 Sun Moon", "radiation", "drag"
@@ -27,10 +28,7 @@ def is_sunlit(state: npt.NDArray[np.float64]) -> bool:
     state : (6,) float
         Position and velocity [km, km/s], in any frame that does not turn.
     """
-    momentum2 = float(np.sum(np.cross(state[:3], state[3:]) ** 2))
-    energy = float(state[3:] @ state[3:]) / 2 - GM_KM3_S2 / float(np.linalg.norm(state[:3]))
-    eccentricity = np.sqrt(max(1 + 2 * energy * momentum2 / GM_KM3_S2**2, 0.0))
-    return bool(momentum2 / GM_KM3_S2 / (1 + eccentricity) > EARTH_RADIUS_KM + RADIATION_KM)
+    return perigee_km(state) > EARTH_RADIUS_KM + RADIATION_KM
 
 
 def surroundings_of(night: str, ahead_ns: int = 0) -> Surroundings:

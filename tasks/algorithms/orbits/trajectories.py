@@ -145,12 +145,22 @@ def _from_node(
 
 def _step(state: Array) -> float:
     """Return the step [s] of an orbit: by its perigee, not below the ground."""
+    r_km = float(np.linalg.norm(state[:3]))
+    lowest_km = min(max(perigee_km(state), EARTH_RADIUS_KM), r_km)
+    return float(STEP_SHARE * np.sqrt(lowest_km**3 / GM_KM3_S2))
+
+
+def perigee_km(state: Array) -> float:
+    """Return the distance of the perigee of a two-body orbit from the geocentre [km].
+
+    state : (6,) or more float
+        Position and velocity [km, km/s], in any frame that does not turn.
+    """
     r_km, v2 = float(np.linalg.norm(state[:3])), float(state[3:6] @ state[3:6])
     momentum2 = float(np.sum(np.cross(state[:3], state[3:6]) ** 2))
     energy = v2 / 2 - GM_KM3_S2 / r_km
     e = np.sqrt(max(1 + 2 * energy * momentum2 / GM_KM3_S2**2, 0.0))
-    perigee_km = max(momentum2 / GM_KM3_S2 / (1 + e), EARTH_RADIUS_KM)
-    return float(STEP_SHARE * np.sqrt(min(perigee_km, r_km) ** 3 / GM_KM3_S2))
+    return float(momentum2 / GM_KM3_S2 / (1 + e))
 
 
 @kernel
