@@ -40,6 +40,7 @@ def with_reports(summary: Summary, staged: Mapping[str, Path], write: bool) -> S
     extracts: list[ReportExtract] = []
     looks: dict[str, list[str]] = {}
     try:
+        write = write and _can_draw()
         nights = nights_in(summary.dataset)
         for night in summary.nights:
             folder = staged[night] if staged[night].is_dir() else None
@@ -47,17 +48,22 @@ def with_reports(summary: Summary, staged: Mapping[str, Path], write: bool) -> S
             broken = new_broken_logs(summary.dataset, night)
             looks[night] = [*broken, *(look.sentence for look in needs_look(facts))]
             if write:
-                try:
-                    text, extract = _page_and_extract(facts)
-                except ReportError as error:  # for this reason none is written: looks go on
-                    LOGGER.info("no report is written: %s", error)
-                    write = False
-                    continue
+                text, extract = _page_and_extract(facts)
                 write_beside(summary.dataset, REPORTS, f"{night}.html", text.encode())
                 extracts.append(extract)
     except Exception as error:  # of drawing, of the store, of anything: the night is done
         LOGGER.warning("the report could not be made: %s", line_of(error))
     return dataclasses.replace(summary, extracts=tuple(extracts), looks=looks)
+
+
+def _can_draw() -> bool:
+    """Return whether reports can be drawn; if not, a line says why."""
+    try:
+        _drawing()
+    except ReportError as error:
+        LOGGER.info("no report is written: %s", error)
+        return False
+    return True
 
 
 def load_drawing() -> None:

@@ -1,5 +1,6 @@
 """The report: as a command, at the end of a run, in a browser."""
 
+import dataclasses
 import json
 import re
 import shutil
@@ -50,6 +51,21 @@ def test_a_report_that_fails_is_a_warning_and_the_night_is_published(
     assert nights_in(tmp_path / "out") == [NIGHT]
     warnings = [r.getMessage() for r in caplog.records if r.levelname == "WARNING"]
     assert warnings == ["the report could not be made: no light"]
+
+
+def test_without_drawing_every_night_is_looked_at(night_run, tmp_path, monkeypatch):
+    def missing():
+        raise ReportError("the report needs matplotlib")
+
+    dataset, summary = night_run
+    nights = [NIGHT, "2019-04-02"]
+    for night in nights:
+        shutil.copytree(dataset / f"night={NIGHT}", tmp_path / f"night={night}")
+    summary = dataclasses.replace(summary, dataset=str(tmp_path), nights=nights)
+    monkeypatch.setattr(reports, "_drawing", missing)
+    made = reports.with_reports(summary, dict.fromkeys(nights, tmp_path / "none"), write=True)
+    assert sorted(made.looks) == nights
+    assert made.extracts == ()
 
 
 def without_matplotlib(code, *arguments):
