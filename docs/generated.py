@@ -245,7 +245,7 @@ def scene() -> str:
 def _bounds(option: FieldInfo) -> str:
     """Return the least and the largest value that a setting may have."""
     bounds = {
-        kind: f"{getattr(each, kind):g}"
+        kind: f"{getattr(each, kind):,.10g}"
         for each in option.metadata
         for kind in ("gt", "ge", "lt", "le")
         if isinstance(getattr(each, kind, None), int | float)

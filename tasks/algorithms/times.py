@@ -162,7 +162,7 @@ def nearest_frame(epoch_ns: Nanoseconds, time_ns: Nanoseconds) -> npt.NDArray[np
 # Share of a sensor's frames at which its counter may restart. Two sensors with one id seem to
 # restart at each second frame.
 MAX_RESTARTS = 0.1
-LARGEST_NUMBER = 2**62
+LARGEST_NUMBER = 2**62  # with a restart after it, sums might not fit in 64 bits
 
 
 def restart_shifts(time_ns: Integers, frame_number: Integers) -> Integers:
@@ -227,8 +227,8 @@ def order_frames(
     verdict : (n,) int8
         In that order. KEEP: the frame is kept. DUPLICATE_FRAME: same sensor, number and time as
         a kept frame. DUPLICATE_NUMBER: same number as an earlier kept frame, at another time (as of
-        two sensors with one id). DUPLICATE_TIME: same time as a kept
-        frame with a lower number: a sensor makes one exposure at a time.
+        two sensors with one id). DUPLICATE_TIME: same time as a kept frame with a lower number: a
+        sensor makes one exposure at a time.
     """
     order = np.lexsort((np.arange(len(sensor)), frame_number, time_ns, sensor))
     s, t, f = sensor[order], time_ns[order], frame_number[order]
