@@ -11,8 +11,8 @@ from typing import NamedTuple
 
 import ccsds_ndm as ccsds
 import numpy as np
-import numpy.typing as npt
 
+from epipole.schemas.arrays import Array, Integers
 from epipole.schemas.errors import DatasetError
 from epipole.schemas.text import as_line
 
@@ -22,7 +22,7 @@ ORIGINATOR = "EPIPOLE"
 _UNSAFE = re.compile(r"[^A-Za-z0-9._+-]")
 
 
-def times(time_ns: npt.NDArray[np.int64]) -> list[str]:
+def times(time_ns: Integers) -> list[str]:
     """Return UTC times to the microsecond: more digits break readers."""
     rounded = ((time_ns + 500) // 1000).astype("datetime64[us]")
     return [str(t) for t in np.datetime_as_string(rounded, unit="us")]
@@ -59,7 +59,6 @@ def write_message(path: Path, text: str) -> None:
 
 # Ephemerides (OEM, OCM) and single states (OPM).
 
-Array = npt.NDArray[np.float64]
 
 _AXES = ("x", "y", "z", "x_dot", "y_dot", "z_dot")
 DEGREE = 7  # of the Hermite interpolation, if there are enough states
@@ -103,9 +102,9 @@ class Ephemeris(NamedTuple):
         Of states and covariances.
     """
 
-    time_ns: npt.NDArray[np.int64]
+    time_ns: Integers
     state: Array
-    covariance_ns: npt.NDArray[np.int64]
+    covariance_ns: Integers
     covariance: Array
     frame: str = "GCRF"
 
@@ -212,7 +211,7 @@ class Directions(NamedTuple):
     comments : sequence of str
     """
 
-    time_ns: npt.NDArray[np.int64]
+    time_ns: Integers
     ra_deg: Array
     dec_deg: Array
     magnitude: Array

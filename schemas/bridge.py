@@ -13,6 +13,7 @@ import polars as pl
 import pyarrow as pa
 import pyarrow.compute as pc
 
+from epipole.schemas.arrays import Array, Flags, Integers
 from epipole.schemas.columns import TIME, upper_triangle
 
 
@@ -135,9 +136,7 @@ def rows_of(values: pa.Table) -> list[dict[str, Any]]:
     return values.to_pylist()  # type: ignore[no-any-return]
 
 
-def stack(
-    values: pa.Table | pl.DataFrame, pattern: str, names: Sequence[str] = "xyz"
-) -> npt.NDArray[np.float64]:
+def stack(values: pa.Table | pl.DataFrame, pattern: str, names: Sequence[str] = "xyz") -> Array:
     """Return the columns of a vector as one (n, len(names)) array, nulls as NaN.
 
     ``stack(positions, "{}_km")`` reads x_km, y_km and z_km.
@@ -157,7 +156,7 @@ def unstack(
 
 def stack_covariance(
     values: pa.Table | pl.DataFrame, pattern: str, names: Sequence[str] = "xyz"
-) -> npt.NDArray[np.float64]:
+) -> Array:
     """Return the columns of an upper triangle as (n, k, k) symmetric matrices, nulls as NaN.
 
     ``stack_covariance(positions, "cov_{}")`` reads cov_xx, cov_xy, ... cov_zz. `names` are the k
@@ -181,7 +180,7 @@ def _triangle(names: Sequence[str]) -> Iterator[tuple[tuple[str, str], tuple[int
     return zip(upper_triangle(names), zip(*np.triu_indices(len(names)), strict=True), strict=True)
 
 
-def _floats(values: pa.Table | pl.DataFrame, name: str) -> npt.NDArray[np.float64]:
+def _floats(values: pa.Table | pl.DataFrame, name: str) -> Array:
     return array(values, name) if isinstance(values, pa.Table) else values[name].to_numpy()
 
 
@@ -195,13 +194,13 @@ def from_polars(schema: pa.Schema, rows: pl.DataFrame) -> pa.Table:
     return table(schema, {n: rows[n].to_arrow() for n in schema.names if n in rows.columns})
 
 
-def nullable(values: npt.NDArray[Any], valid: npt.NDArray[np.bool_] | None = None) -> pa.Array:
+def nullable(values: npt.NDArray[Any], valid: Flags | None = None) -> pa.Array:
     """Return an Arrow array that is null where not `valid` (default: where NaN)."""
     valid = np.isfinite(values) if valid is None else valid
     return pa.array(values, mask=~valid)
 
 
-def flatten(values: pa.Table, name: str) -> tuple[npt.NDArray[Any], npt.NDArray[np.int64]]:
+def flatten(values: pa.Table, name: str) -> tuple[npt.NDArray[Any], Integers]:
     """Return a list column as flat values and (n + 1) offsets.
 
     Row i is ``flat[offsets[i]:offsets[i + 1]]``.

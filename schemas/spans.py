@@ -7,9 +7,9 @@ another log of a night does not shift them, and no span contains a midnight.
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 import pyarrow as pa
 
+from epipole.schemas.arrays import Flags, Integers
 from epipole.schemas.bridge import array
 
 DAY_NS = 86_400_000_000_000
@@ -28,7 +28,7 @@ class Span(NamedTuple):
         """Return the span with a margin at both ends."""
         return Span(self.start_ns - margin_ns, self.end_ns + margin_ns)
 
-    def holds(self, time_ns: npt.NDArray[np.int64]) -> npt.NDArray[np.bool_]:
+    def holds(self, time_ns: Integers) -> Flags:
         """Return which instants lie in the span."""
         return (time_ns >= self.start_ns) & (time_ns < self.end_ns)
 

@@ -19,6 +19,7 @@ from epipole.tasks.algorithms.orbits.reference_frames import (
     EME2000_FROM_GCRF,
     from_gcrf,
     orientation_at,
+    state_rotation,
 )
 from epipole.tasks.algorithms.orbits.trajectories import propagate_unknowns
 from epipole.tasks.common.orbit_forces import areas_in
@@ -157,7 +158,7 @@ def orbit_arc(
     """
     half_s = max(orbit["arc_s"] / 2, 1.0)
     epoch_s = (orbit["epoch_ns"] - origin_ns) / SECOND_NS
-    R = np.kron(np.eye(2), around.R_night_from_gcrf)
+    R = state_rotation(around.R_night_from_gcrf)
     of = single_orbit(orbit)
     start = np.concatenate([R @ of.state[0], areas_in(orbit["forces"])])
     found: list[tuple[float, np.ndarray, np.ndarray]] = []

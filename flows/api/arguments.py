@@ -4,9 +4,9 @@ import datetime
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
-Array = npt.NDArray[np.float64]
+from epipole.schemas.arrays import Array
+
 Time = datetime.datetime | np.datetime64 | str | int
 
 

@@ -9,6 +9,7 @@ import pyarrow as pa
 from epipole.flows.api.arguments import Array, Time, floats, time_ns
 from epipole.flows.api.objects import View
 from epipole.io.catalogues.star_catalogue import read_star_catalogue
+from epipole.schemas.arrays import Integers
 from epipole.schemas.bridge import (
     array,
     nullable,
@@ -52,7 +53,7 @@ class IdentifiedFrame(NamedTuple):
         Rms of the star residuals per axis [px]; NaN without stars.
     """
 
-    star_id: npt.NDArray[np.int64]
+    star_id: Integers
     attitude_xyzw: Array
     attitude_cov_arcsec2: Array
     source: str

@@ -7,14 +7,13 @@ import numpy as np
 import numpy.typing as npt
 
 from epipole.flows.api.arguments import Array, floats
+from epipole.schemas.arrays import Flags, Indices
 from epipole.schemas.settings import Settings
 from epipole.tasks.algorithms.association.samples import Samples
 from epipole.tasks.algorithms.geometry import triangulation
 from epipole.tasks.algorithms.geometry.camera import Camera
 from epipole.tasks.algorithms.geometry.directions import matrix_from_quaternion
 from epipole.tasks.solve.associate_objects import associate_by_likelihood
-
-Indices = npt.NDArray[np.int64]
 
 
 class View(NamedTuple):
@@ -65,7 +64,7 @@ class FoundObjects(NamedTuple):
 
     objects: list[Indices]
     log_odds: Array
-    ambiguous: list[npt.NDArray[np.bool_]]
+    ambiguous: list[Flags]
 
 
 class Positions(NamedTuple):
@@ -87,7 +86,7 @@ class Positions(NamedTuple):
     r_gcrf_km: Array
     cov_km2: Array
     chi2: Array
-    used: list[npt.NDArray[np.bool_]]
+    used: list[Flags]
 
 
 def associate(views: Sequence[View], settings: Settings | None = None) -> FoundObjects:

@@ -7,6 +7,7 @@ import numpy.typing as npt
 import polars as pl
 
 from epipole.flows.api.arguments import Array, Time, floats, time_ns
+from epipole.schemas.arrays import Flags
 from epipole.schemas.columns import ELEMENTS
 from epipole.schemas.settings import Settings
 from epipole.tasks.algorithms.constants import ARCSEC, SECOND_NS
@@ -18,6 +19,7 @@ from epipole.tasks.algorithms.geometry.directions import (
 )
 from epipole.tasks.algorithms.orbit_linking.grouping import link_tracklets
 from epipole.tasks.algorithms.orbits.orbital_elements import IN_DEGREES, elements_of
+from epipole.tasks.algorithms.orbits.reference_frames import state_rotation
 from epipole.tasks.algorithms.tracking.attributables import attributables
 from epipole.tasks.common.orbit_forces import noon_ns, surroundings_of
 from epipole.tasks.common.tracklet_arrays import (
@@ -29,7 +31,6 @@ from epipole.tasks.publish.object_orbits import (
     OBSERVED,
     Start,
     best_orbit,
-    both,
     judge,
     observed_objects,
 )
@@ -89,7 +90,7 @@ class ObjectOrbit(NamedTuple):
     cov: Array
     chi2: float
     dof: int
-    used: npt.NDArray[np.bool_]
+    used: Flags
     forces: str
     elements: dict[str, float]
     verdict: str | None
@@ -286,7 +287,7 @@ def fit_orbit(observations: pl.DataFrame, start: npt.ArrayLike | None = None) ->
         return ObjectOrbit(epoch, nothing[0], nothing[1:], np.nan, 0, unused, "", none, reason)
     used = np.zeros(len(rows), bool)
     used[rows["row"].to_numpy()] = fitted.orbit.used
-    turn = both(around.R_night_from_gcrf.T)
+    turn = state_rotation(around.R_night_from_gcrf.T)
     state = turn @ fitted.orbit.unknowns[:6]
     values = elements_of(state) * IN_DEGREES
     return ObjectOrbit(

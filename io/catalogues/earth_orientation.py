@@ -6,7 +6,8 @@ from typing import NamedTuple
 
 import astropy_iers_data
 import numpy as np
-import numpy.typing as npt
+
+from epipole.schemas.arrays import Array
 
 ARCSEC = np.pi / 648000.0
 
@@ -18,10 +19,10 @@ _MJD, _X, _Y, _UT1 = slice(7, 15), slice(18, 27), slice(37, 46), slice(58, 68)
 class EarthOrientation(NamedTuple):
     """One value per day: measured ones, then predicted ones."""
 
-    mjd: npt.NDArray[np.float64]  # (n,) UTC, increasing
-    ut1_utc_s: npt.NDArray[np.float64]  # (n,)
-    xp_rad: npt.NDArray[np.float64]  # (n,) polar motion
-    yp_rad: npt.NDArray[np.float64]  # (n,)
+    mjd: Array  # (n,) UTC, increasing
+    ut1_utc_s: Array  # (n,)
+    xp_rad: Array  # (n,) polar motion
+    yp_rad: Array  # (n,)
 
 
 @cache

@@ -5,11 +5,9 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
+from epipole.schemas.arrays import Array, Integers
 from epipole.schemas.errors import CatalogueError
-
-Array = npt.NDArray[np.float64]
 
 NAME = "gaia-dr3"
 GAIA_EPOCH = 2016.0  # Julian year of Gaia's positions
@@ -32,7 +30,7 @@ class GaiaStars(NamedTuple):
     g, bp, rp : magnitudes; NaN where not measured
     """
 
-    star_id: npt.NDArray[np.int64]
+    star_id: Integers
     ra_deg: Array
     dec_deg: Array
     g: Array

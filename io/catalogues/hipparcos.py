@@ -8,6 +8,7 @@ import numpy as np
 import numpy.typing as npt
 import pyarrow as pa
 
+from epipole.schemas.arrays import Array
 from epipole.schemas.bridge import table
 from epipole.schemas.errors import CatalogueError
 from epipole.schemas.star_lists import STAR_CATALOGUE, CatalogueLabel, labelled
@@ -79,7 +80,7 @@ def read_hipparcos(path: Path | None = None) -> pa.Table:
     )
 
 
-def johnson_v(hp: npt.NDArray[np.float64], b_v: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+def johnson_v(hp: Array, b_v: Array) -> Array:
     """Return Johnson V [mag] from Hipparcos' Hp and B-V [mag].
 
     The polynomial is not valid outside -0.4 to 2, so B-V is limited to this range.
@@ -88,7 +89,7 @@ def johnson_v(hp: npt.NDArray[np.float64], b_v: npt.NDArray[np.float64]) -> npt.
     return hp - b * (0.3041 + b * (-0.2023 + b * (0.1070 - b * 0.0453)))
 
 
-def _rms(a: npt.NDArray[np.float64], b: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+def _rms(a: Array, b: Array) -> Array:
     return np.sqrt((a**2 + b**2) / 2)
 
 
@@ -102,7 +103,7 @@ def _lines(path: Path) -> npt.NDArray[np.uint8]:
     return bytes_read.reshape(-1, _LINE)
 
 
-def _decimals(text: npt.NDArray[np.uint8], decimals: int) -> npt.NDArray[np.float64]:
+def _decimals(text: npt.NDArray[np.uint8], decimals: int) -> Array:
     """Return the numbers of a fixed-point column, one row of `text` per character.
 
     This is far faster than parsing line by line.

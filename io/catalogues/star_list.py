@@ -11,6 +11,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from epipole.io.paths import refuse_device
+from epipole.schemas.arrays import Array, Flags, Integers
 from epipole.schemas.bridge import table
 from epipole.schemas.errors import CatalogueError
 from epipole.schemas.star_lists import (
@@ -40,8 +41,6 @@ _BOUNDS = {
 _TRUTH = {"true": True, "1": True, "false": False, "0": False}
 # Fewer stars than this may all lie where degrees look like radians or hours.
 _MANY = 100
-
-Array = npt.NDArray[np.float64]
 
 
 class StarList(NamedTuple):
@@ -103,7 +102,7 @@ class _Faults:
         self.path, self.read = path, read
         self._found: dict[int, str] = {}
 
-    def add(self, bad: npt.NDArray[np.bool_], column: str, why: str) -> None:
+    def add(self, bad: Flags, column: str, why: str) -> None:
         for row in np.flatnonzero(bad).tolist():
             value = self.read[column][row]
             what = f"{column} is empty" if value is None else f"{column} = {value}"
@@ -167,7 +166,7 @@ def _columns(read: pl.DataFrame, faults: _Faults) -> dict[str, npt.NDArray[Any]]
     return columns
 
 
-def _identities(read: pl.DataFrame, faults: _Faults) -> npt.NDArray[np.int64]:
+def _identities(read: pl.DataFrame, faults: _Faults) -> Integers:
     """Return the ids of the stars. Each must be a whole number, and occur once."""
     numbers = read["star_id"].cast(pl.Int64, strict=False)
     missing = numbers.is_null().to_numpy()
@@ -195,7 +194,7 @@ def _numbers(read: pl.DataFrame, name: str, bounds: tuple[float, float], faults:
     return numbers
 
 
-def _flags(read: pl.DataFrame, faults: _Faults) -> npt.NDArray[np.bool_]:
+def _flags(read: pl.DataFrame, faults: _Faults) -> Flags:
     if "variable" not in read.columns:
         return np.zeros(read.height, bool)
     texts = read["variable"].cast(pl.String, strict=False).str.to_lowercase()

@@ -9,8 +9,6 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-import numpy.typing as npt
 import polars as pl
 import pyarrow as pa
 import pyarrow.parquet as pq
@@ -22,6 +20,7 @@ from epipole.io.datasets.table_pieces import (
     within_bounds,
 )
 from epipole.io.paths import file_system, storage_errors
+from epipole.schemas.arrays import Integers
 from epipole.schemas.bridge import conform, to_polars
 from epipole.schemas.errors import DatasetError
 from epipole.schemas.tables import TABLES
@@ -232,9 +231,7 @@ def read_columns(night: Where, name: str, columns: Sequence[str]) -> pa.Table:
         return pq.read_table(file, columns=list(columns), partitioning=None)
 
 
-def take_rows(
-    night: Path, name: str, columns: Sequence[str], rows: npt.NDArray[np.int64]
-) -> pa.Table:
+def take_rows(night: Path, name: str, columns: Sequence[str], rows: Integers) -> pa.Table:
     """Return some rows of a table that `write_table` wrote; `rows` are in order."""
     file = pq.ParquetFile((night / name / PART).absolute())
     start, taken = 0, []

@@ -4,9 +4,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
-import numpy.typing as npt
 import pyarrow as pa
 
+from epipole.schemas.arrays import Nanoseconds
 from epipole.schemas.bridge import array
 from epipole.schemas.log_bounds import FAR_FROM_LOG_NS
 from epipole.schemas.rejects import Reason, reject_rows
@@ -78,8 +78,6 @@ class RejectList:
 
 
 # Strays: a frame with a wrong clock would otherwise make a night that has only this frame.
-
-Nanoseconds = npt.NDArray[np.int64]
 
 
 def log_time_range(times: Sequence[Nanoseconds]) -> tuple[int, int] | None:

@@ -12,7 +12,6 @@ from collections.abc import Iterator
 from concurrent.futures import Executor, ThreadPoolExecutor
 
 import numpy as np
-import numpy.typing as npt
 import pyarrow as pa
 
 from epipole.io.logs.left_out import RejectList, log_time_range, stray_rejects, without_strays
@@ -26,6 +25,7 @@ from epipole.io.logs.messages.frames import FrameColumns
 from epipole.io.logs.messages.registry import kinds_of_schemas, message_encodings
 from epipole.io.logs.messages.states import StateColumns
 from epipole.io.paths import known_as
+from epipole.schemas.arrays import Integers, Nanoseconds
 from epipole.schemas.bridge import array
 from epipole.schemas.log_messages import CALIBRATION, FRAME, KINDS, STATE
 from epipole.schemas.rejects import Reason
@@ -35,7 +35,6 @@ from epipole.schemas.work_tables import LogContents, LogPiece, LogSource
 
 LOGGER = logging.getLogger(__name__)
 
-Nanoseconds = npt.NDArray[np.int64]
 
 PER_MESSAGE = ("channel", "time_ns", "start", "end", "offset")  # columns of a block
 THREADS = 2  # that decompress and check chunks, in addition to the one that decodes
@@ -173,7 +172,7 @@ class _Reading:
         return block._replace(channels=known, **columns)
 
 
-def _by_kind(block: Block) -> Iterator[tuple[str, npt.NDArray[np.int64]]]:
+def _by_kind(block: Block) -> Iterator[tuple[str, Integers]]:
     """Yield the kinds of message in a block, each with the numbers of its messages."""
     if not block.channels:
         return

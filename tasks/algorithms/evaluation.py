@@ -4,12 +4,10 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 from scipy.interpolate import CubicHermiteSpline
 from scipy.spatial.transform import Rotation
 
-Array = npt.NDArray[np.float64]
-Indices = npt.NDArray[np.int64]
+from epipole.schemas.arrays import Array, Indices
 
 
 def attitude_errors(q_found: Array, q_true: Array) -> tuple[Array, Array]:

@@ -8,11 +8,9 @@ from stars that are measured repeatedly.
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 from scipy.optimize import nnls
 
-Array = npt.NDArray[np.float64]
-Indices = npt.NDArray[np.int64]
+from epipole.schemas.arrays import Array, Indices
 
 MIN_VALUES = 20  # minimum number of residuals for an estimate of the variance
 MIN_PER_BIN = 25  # minimum number of residuals per bin of flux

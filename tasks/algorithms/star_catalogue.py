@@ -7,14 +7,11 @@ prepare its source: Gaia with V magnitudes, and the bright stars of Hipparcos th
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 from scipy.spatial import cKDTree
 
+from epipole.schemas.arrays import Array, Indices, Integers
 from epipole.tasks.algorithms.constants import ARCSEC, AU_KM
 from epipole.tasks.algorithms.geometry.directions import radec_from_unit, unit_from_radec
-
-Array = npt.NDArray[np.float64]
-Rows = npt.NDArray[np.int64]
 
 MAS = np.pi / 648_000_000.0  # rad
 # Largest separation of one star in both: 99.9 % of Hipparcos' positions at 2016 are within 0.7" of
@@ -39,7 +36,7 @@ class NavigationCatalogue(NamedTuple):
     magnitude : (n,) float, V; of merged doubles the total
     """
 
-    star_id: npt.NDArray[np.int64]
+    star_id: Integers
     u_icrs: Array
     magnitude: Array
 
@@ -88,7 +85,7 @@ def star_sigmas(sigma_mas: Array, pm_sigma_mas_yr: Array, years: float) -> Array
 
 
 def navigation_catalogue(
-    star_id: npt.NDArray[np.int64], u_icrs: Array, magnitude: Array, merge_rad: float
+    star_id: Integers, u_icrs: Array, magnitude: Array, merge_rad: float
 ) -> NavigationCatalogue:
     """Return the stars, brightest first, with those closer than `merge_rad` merged.
 
@@ -142,8 +139,8 @@ class Joined(NamedTuple):
     missing : (k,) int, rows of Hipparcos stars that Gaia lacks
     """
 
-    hipparcos_of: Rows
-    missing: Rows
+    hipparcos_of: Indices
+    missing: Indices
 
 
 def johnson_v_of_gaia(g: Array, bp: Array, rp: Array) -> Array:

@@ -6,11 +6,8 @@ import erfa
 import numpy as np
 import numpy.typing as npt
 
+from epipole.schemas.arrays import Array, Flags, Integers, Nanoseconds
 from epipole.tasks.algorithms.constants import AU_KM, DAY_NS, DAY_S
-
-Array = npt.NDArray[np.float64]
-Nanoseconds = npt.NDArray[np.int64]
-Integers = npt.NDArray[np.int64]
 
 UNIX_EPOCH_JD = 2440587.5
 NODE_NS = 600_000_000_000
@@ -140,7 +137,7 @@ def epoch_grid(first_ns: int, last_ns: int, interval_ns: int) -> Nanoseconds:
     return np.concatenate(out) if out else np.zeros(0, np.int64)
 
 
-def nearest_frame(epoch_ns: Nanoseconds, time_ns: Nanoseconds) -> npt.NDArray[np.int64]:
+def nearest_frame(epoch_ns: Nanoseconds, time_ns: Nanoseconds) -> Integers:
     """Return the index of the frame nearest to each epoch; the earlier one of a tie.
 
     Parameters
@@ -251,7 +248,7 @@ def order_frames(
     return order, verdict
 
 
-def order_states(sensor: Integers, time_ns: Integers) -> tuple[Integers, npt.NDArray[np.bool_]]:
+def order_states(sensor: Integers, time_ns: Integers) -> tuple[Integers, Flags]:
     """Return the order of states by sensor and time, and which of them repeat their predecessor.
 
     A state repeats if sensor and time are the same; the first given is kept.

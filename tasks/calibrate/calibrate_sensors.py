@@ -9,10 +9,10 @@ from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 import pyarrow as pa
 
 from epipole.io.work.parts import Parts
+from epipole.schemas.arrays import Array
 from epipole.schemas.bridge import (
     array,
     concat,
@@ -44,7 +44,6 @@ from epipole.tasks.common.batches import Batch
 from epipole.tasks.common.sightings import camera_of, optics_covariance_of
 from epipole.tasks.common.stage_tasks import stage_task
 
-Array = npt.NDArray[np.float64]
 LOGGER = logging.getLogger(__name__)
 
 MAX_STARS = 20_000  # of a fit; with more, sigmas would be below the errors of the model

@@ -12,13 +12,13 @@ from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 import pyarrow as pa
 import pyarrow.compute as pc
 
 from epipole.io.catalogues.star_catalogue import read_star_catalogue
 from epipole.io.work.parts import Parts
 from epipole.io.work.work_layout import ReadFolder
+from epipole.schemas.arrays import Array, Indices
 from epipole.schemas.bridge import array, concat, flatten, rows_with
 from epipole.schemas.settings import IdentificationSettings, SensorSettings
 from epipole.schemas.spans import Sensor, Span
@@ -48,8 +48,6 @@ from epipole.tasks.identify.identify_stars import match_settings
 from epipole.tasks.identify.tabulate import barycentric_velocity
 from epipole.tasks.read.order_frames import frames_between
 
-Array = npt.NDArray[np.float64]
-Indices = npt.NDArray[np.int64]
 LOGGER = logging.getLogger(__name__)
 
 # The camera is searched for if at most the first share of the frames was identified. If no camera

@@ -5,12 +5,12 @@ from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 import polars as pl
 import pyarrow as pa
 
 from epipole.io.work.parts import Parts
 from epipole.io.work.work_layout import SolvedParts, ViewedParts
+from epipole.schemas.arrays import Array
 from epipole.schemas.bridge import array, concat, stack, stack_covariance, to_polars
 from epipole.schemas.columns import TANGENT_AXES
 from epipole.schemas.rejects import Reason
@@ -31,8 +31,6 @@ from epipole.tasks.algorithms.sensor_faults.fault_judgement import (
 from epipole.tasks.algorithms.sensor_faults.suspects import judge_many_sensors
 from epipole.tasks.common.stage_tasks import stage_task
 from epipole.tasks.solve.sample_sight_lines import pair_with_objects
-
-Array = npt.NDArray[np.float64]
 
 MAX_EPOCHS = 300  # more do not help: the offset is constant
 MAX_LINES = 30_000  # lines of sight to objects, of all sensors together

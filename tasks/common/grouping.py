@@ -6,6 +6,8 @@ import numpy as np
 import numpy.typing as npt
 import pyarrow as pa
 
+from epipole.schemas.arrays import Integers
+
 # Factorized columns.
 
 
@@ -13,7 +15,7 @@ class Factorized(NamedTuple):
     """The rank of each row's text, (n,) int, among the distinct ones (-1: null); and these, in
     order."""
 
-    rank: npt.NDArray[np.int64]
+    rank: Integers
     texts: npt.NDArray[np.str_]
 
 
@@ -30,7 +32,7 @@ def factorize(values: pa.Table, name: str) -> Factorized:
 # Runs of equal rows.
 
 
-def group_offsets(*keys: npt.NDArray[Any]) -> npt.NDArray[np.int64]:
+def group_offsets(*keys: npt.NDArray[Any]) -> Integers:
     """Return where each run of rows that are equal in all keys begins, and where the last one ends.
 
     Run k has the rows ``bounds[k]:bounds[k + 1]``. Without rows it is [0]: no run.

@@ -3,9 +3,9 @@
 import re
 
 import numpy as np
-import numpy.typing as npt
 
 from epipole.io.catalogues.earth_orientation import read_earth_orientation
+from epipole.schemas.arrays import Array
 from epipole.schemas.spans import DAY_NS
 from epipole.tasks.algorithms.constants import EARTH_RADIUS_KM
 from epipole.tasks.algorithms.orbits.forces import Surroundings, surroundings
@@ -22,7 +22,7 @@ RADIATION_KM = 1000.0
 SUNLIT_AREA, AIR_AREA = (0.02, 0.02), (0.03, 0.06)  # mean and sigma [m^2/kg]
 
 
-def is_sunlit(state: npt.NDArray[np.float64]) -> bool:
+def is_sunlit(state: Array) -> bool:
     """Return whether radiation moves a satellite more than air does: it stays high.
 
     state : (6,) float

@@ -9,6 +9,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from epipole.io.work.work_layout import SensorParts
+from epipole.schemas.arrays import Array, Flags, Indices, Integers
 from epipole.schemas.bridge import array, concat, stack, stack_covariance, table
 from epipole.schemas.columns import OPTICS_AXES
 from epipole.schemas.settings import TrackletSettings
@@ -23,9 +24,6 @@ from epipole.tasks.algorithms.times import frame_interval_ns
 
 # Sightings of tracklets.
 
-Array = npt.NDArray[np.float64]
-Indices = npt.NDArray[np.int64]
-
 
 class Frames(NamedTuple):
     """Frames of one sensor, in time order.
@@ -34,15 +32,15 @@ class Frames(NamedTuple):
     """
 
     table: pa.Table
-    number: npt.NDArray[np.int64]
-    time_ns: npt.NDArray[np.int64]
+    number: Integers
+    time_ns: Integers
     q_sensor_from_icrs: Array
     cov_att_rad2: Array
-    from_stars: npt.NDArray[np.bool_]
+    from_stars: Flags
     r_gcrf_km: Array
     v_gcrf_km_s: Array
     position_sigma_km: Array
-    camera: npt.NDArray[np.int64]
+    camera: Integers
 
 
 def solved_frames(solutions: pa.Table) -> Frames:
@@ -88,10 +86,10 @@ class Sightings(NamedTuple):
     is independent, that of a prior is common.
     """
 
-    row: npt.NDArray[np.int64]
-    frame: npt.NDArray[np.int64]
-    time_ns: npt.NDArray[np.int64]
-    offsets: npt.NDArray[np.int64]
+    row: Integers
+    frame: Integers
+    time_ns: Integers
+    offsets: Integers
     u_icrs: Array
     cov_noise: Array
     cov_bias: Array
@@ -155,7 +153,7 @@ def _in_frames(frames: Frames, detections: pa.Table) -> tuple[Indices, Indices]:
     return row[order], frame[order]
 
 
-def part_of(sightings: Sightings, kept: npt.NDArray[np.bool_]) -> Sightings:
+def part_of(sightings: Sightings, kept: Flags) -> Sightings:
     """Return some of the sightings, in the same order."""
     before = np.concatenate([[0], np.cumsum(kept)])
     return Sightings(
@@ -186,9 +184,7 @@ def optics_covariance_of(cameras: pa.Table, row: int) -> Array:
 MARK = "lone:"  # sensor ids have no colon, so no other id begins like this
 
 
-def in_lone_frames(
-    frame_time_ns: npt.NDArray[np.int64], settings: TrackletSettings
-) -> npt.NDArray[np.bool_]:
+def in_lone_frames(frame_time_ns: Integers, settings: TrackletSettings) -> Flags:
     """Return which frames of one sensor, in time order, have too few others near for a tracklet."""
     if not len(frame_time_ns):
         return np.zeros(0, bool)
@@ -197,7 +193,7 @@ def in_lone_frames(
     return np.asarray(np.bincount(run)[run] < settings.min_detections)
 
 
-def with_lone_detections(detections: pa.Table, lone: npt.NDArray[np.bool_]) -> pa.Table:
+def with_lone_detections(detections: pa.Table, lone: Flags) -> pa.Table:
     """Return the detections; each lone one gets an unpublished tracklet_id."""
     names = array(detections, "tracklet_id").copy()
     rows = np.flatnonzero(lone)

@@ -1,17 +1,14 @@
 """Arrays of tracklets: attributables and their covariances, from rows of TRACKLETS."""
 
 import numpy as np
-import numpy.typing as npt
 import polars as pl
 
+from epipole.schemas.arrays import Array
 from epipole.schemas.bridge import stack_covariance
 from epipole.schemas.columns import ATTRIBUTABLE_AXES, POSITION, VELOCITY
 from epipole.tasks.algorithms.constants import ARCSEC
 from epipole.tasks.algorithms.geometry.directions import east_north, unit_from_radec
 from epipole.tasks.algorithms.orbit_linking.arc_fit import Tracklets
-
-Array = npt.NDArray[np.float64]
-
 
 # Tracklets with an attributable, and a sensor whose position and velocity are known.
 HAS_ATTRIBUTABLE = pl.all_horizontal(

@@ -4,19 +4,17 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 import polars as pl
 import pyarrow as pa
 
 from epipole.io.simulation.truth import Truth, elements_of
+from epipole.schemas.arrays import Array, Indices
 from epipole.schemas.bridge import array, stack, to_polars
 from epipole.tasks.algorithms.evaluation import SampledOrbits, interpolate_orbits, majority
 from epipole.tasks.algorithms.simulation.paths import state_at
 
 # Centroids: which star or object each shows.
 
-Array = npt.NDArray[np.float64]
-Indices = npt.NDArray[np.int64]
 Measures = dict[str, Any]  # by their names in `Report`
 
 FRAME = ["sensor_id", "frame_number"]

@@ -11,6 +11,7 @@ import numpy as np
 import numpy.typing as npt
 import pyarrow as pa
 
+from epipole.schemas.arrays import Array, Flags, Integers
 from epipole.schemas.bridge import array, flatten, nullable, stack, table, unstack
 from epipole.schemas.log_bounds import POSITION, SPEED
 from epipole.schemas.settings import SensorSettings
@@ -28,7 +29,6 @@ from epipole.tasks.algorithms.orbits.state_interpolation import (
     interpolate_states,
 )
 
-Array = npt.NDArray[np.float64]
 LOGGER = logging.getLogger(__name__)
 
 
@@ -39,16 +39,16 @@ class FlatCentroids(NamedTuple):
     `cameras`; -1 where a frame's camera is unknown.
     """
 
-    first: npt.NDArray[np.int64]
-    frame: npt.NDArray[np.int64]
+    first: Integers
+    frame: Integers
     x_px: Array
     y_px: Array
     flux: Array
     sigma_px: Array  # NaN where unknown
     u: Array  # sensor axes at the frame's time
     pixel_rad: Array
-    in_image: npt.NDArray[np.bool_]  # of the frame's camera; false without one
-    camera_of_frame: npt.NDArray[np.int64]
+    in_image: Flags  # of the frame's camera; false without one
+    camera_of_frame: Integers
     cameras: dict[int, Camera]
     row_s: Array  # time of a centroid's row after the frame's
     turn: Array  # (N, 3) rotation of directions from the frame's time to the row's [rad]
@@ -92,9 +92,7 @@ def _optional(exposures: pa.Table, name: str, n: int) -> Array:
     return values
 
 
-def _cameras_of(
-    exposures: pa.Table, cameras: pa.Table
-) -> tuple[npt.NDArray[np.int64], dict[int, Camera]]:
+def _cameras_of(exposures: pa.Table, cameras: pa.Table) -> tuple[Integers, dict[int, Camera]]:
     """Return the row of `cameras` that is valid for each frame (-1: unknown), and these cameras."""
     rows = np.flatnonzero(array(cameras, "sensor_id") == exposures["sensor_id"][0].as_py())
     if len(rows) == 0:
@@ -175,7 +173,7 @@ def _possible(found: InterpolatedStates) -> InterpolatedStates:
     )
 
 
-def _states_sigma(states: pa.Table, at_ns: npt.NDArray[np.int64]) -> npt.NDArray[np.bool_]:
+def _states_sigma(states: pa.Table, at_ns: Integers) -> Flags:
     """Return whether the states of one sensor on both sides of each time state their sigma."""
     if not states.num_rows:
         return np.zeros(len(at_ns), bool)

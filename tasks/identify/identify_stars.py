@@ -5,9 +5,9 @@ from collections.abc import Iterator
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 import pyarrow as pa
 
+from epipole.schemas.arrays import Array, Flags, Integers
 from epipole.schemas.bridge import array, empty, stack
 from epipole.schemas.options import STAR_IDENTIFICATION, load_method
 from epipole.schemas.settings import IdentificationSettings, SensorSettings
@@ -39,7 +39,6 @@ from epipole.tasks.identify.tabulate import (
     stars_table,
 )
 
-Array = npt.NDArray[np.float64]
 LOGGER = logging.getLogger(__name__)
 
 
@@ -110,7 +109,7 @@ def _identify(
     catalogue: pa.Table,
     sensors: SensorSettings,
     rule: IdentificationSettings,
-) -> tuple[IdentifiedSensor | None, npt.NDArray[np.int64]]:
+) -> tuple[IdentifiedSensor | None, Integers]:
     """Return the identified stars, and the centroids that took part: brightest first in each
     frame."""
     rows = brightest_first(c.first, c.flux)
@@ -144,7 +143,7 @@ def match_settings(rule: IdentificationSettings) -> MatchSettings:
     return MatchSettings(rule.gate_sigma, -np.log(rule.false_alarm), rule.time_limit_s, np.nan)
 
 
-def _selections(c: FlatCentroids) -> Iterator[npt.NDArray[np.bool_]]:
+def _selections(c: FlatCentroids) -> Iterator[Flags]:
     """Yield which centroids may be stars: without the static ones, if there are many; then all.
 
     A centroid outside the image is never a star.
@@ -156,9 +155,7 @@ def _selections(c: FlatCentroids) -> Iterator[npt.NDArray[np.bool_]]:
     yield c.in_image
 
 
-def _raw_centroids(
-    c: FlatCentroids, rows: npt.NDArray[np.int64], kept: npt.NDArray[np.bool_], beta: Array
-) -> RawCentroids:
+def _raw_centroids(c: FlatCentroids, rows: Integers, kept: Flags, beta: Array) -> RawCentroids:
     """Return these centroids, which are those kept in another order."""
     counts = np.bincount(c.frame[kept], minlength=len(c.first) - 1)
     return RawCentroids(
@@ -233,9 +230,7 @@ def _with_unknown_velocity(a: StarAttitudes, frame_states: pa.Table) -> StarAtti
     return a._replace(shared_arcsec2=a.shared_arcsec2 + unknown[:, None, None] * across)
 
 
-def _matches(
-    found: IdentifiedSensor | None, rows: npt.NDArray[np.int64], c: FlatCentroids
-) -> MatchedStars:
+def _matches(found: IdentifiedSensor | None, rows: Integers, c: FlatCentroids) -> MatchedStars:
     """Return the stars of the centroids; `rows` took part, in this order."""
     if found is None:
         none, frames = np.empty(0, np.int64), len(c.first) - 1

@@ -8,16 +8,14 @@ that an unknown rate makes, and then again.
 from collections.abc import Callable
 
 import numpy as np
-import numpy.typing as npt
 import pyarrow as pa
 
+from epipole.schemas.arrays import Array, Integers
 from epipole.schemas.bridge import array, stack
 from epipole.tasks.algorithms.geometry.directions import matrix_from_quaternion
 from epipole.tasks.algorithms.geometry.turning import angular_rates, turned
 from epipole.tasks.algorithms.star_identification.sensor import IdentifiedSensor
 from epipole.tasks.identify.frame_inputs import FlatCentroids
-
-Array = npt.NDArray[np.float64]
 
 # Rates that are assumed of a sensor, 1-sigma [rad/s], until enough of its frames are identified: as
 # its prior attitudes tell, or at rest; 0.1; 1 degree per second. Share of frames that is enough.
@@ -27,7 +25,7 @@ UNKNOWN_RATES, ENOUGH = (0.0, 2e-3, 2e-2), 0.5
 ROUNDS, SETTLED_PX = 4, 0.02
 ASSUMED_PX = 0.3  # 1-sigma of a centroid that states none, beside the error of an unknown rate
 
-Identified = tuple[IdentifiedSensor | None, npt.NDArray[np.int64]]
+Identified = tuple[IdentifiedSensor | None, Integers]
 
 
 def identify_at_frame_times(

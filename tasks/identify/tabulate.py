@@ -10,6 +10,7 @@ import numpy as np
 import numpy.typing as npt
 import pyarrow as pa
 
+from epipole.schemas.arrays import Array, Flags, Integers
 from epipole.schemas.bridge import (
     array,
     concat,
@@ -35,16 +36,10 @@ from epipole.tasks.algorithms.photometry import flux_scale
 from epipole.tasks.algorithms.times import earth_velocity
 from epipole.tasks.identify.frame_inputs import FlatCentroids
 
-Array = npt.NDArray[np.float64]
-Flags = npt.NDArray[np.bool_]
-
-
 # The limit of detections.
 
 
-def within_limit(
-    frame: npt.NDArray[np.int64], flux: npt.NDArray[np.float64], max_detections: int
-) -> Flags:
+def within_limit(frame: Integers, flux: Array, max_detections: int) -> Flags:
     """Return which detections are kept, so that there are at most `max_detections`.
 
     The fullest frames are cut to one number, and keep their brightest. Frames with fewer keep all.
@@ -65,7 +60,7 @@ def within_limit(
     return np.asarray(rank < _max_per_frame(counts, max_detections))
 
 
-def _max_per_frame(counts: npt.NDArray[np.int64], max_detections: int) -> int:
+def _max_per_frame(counts: Integers, max_detections: int) -> int:
     """Return the largest number per frame that keeps all frames together within the limit."""
     low, high = 0, int(counts.max())
     while low < high:
@@ -97,15 +92,15 @@ class MatchedStars(NamedTuple):
     the error that is added in quadrature to the stated ones.
     """
 
-    at: npt.NDArray[np.int64]
-    star_id: npt.NDArray[np.int64]
+    at: Integers
+    star_id: Integers
     magnitude: Array
     u_icrs: Array
     scale: Array
     floor_px: float = 0.0
 
 
-def barycentric_velocity(time_ns: npt.NDArray[np.int64], frame_states: pa.Table) -> Array:
+def barycentric_velocity(time_ns: Integers, frame_states: pa.Table) -> Array:
     """Return the sensor's barycentric velocity [km/s].
 
     Where the sensor's geocentric velocity is unknown, it is the Earth's.
@@ -113,7 +108,7 @@ def barycentric_velocity(time_ns: npt.NDArray[np.int64], frame_states: pa.Table)
     return earth_velocity(time_ns) + np.nan_to_num(stack(frame_states, "v{}_km_s"))
 
 
-def _frame_key(exposures: pa.Table, frame: npt.NDArray[np.int64]) -> dict[str, Any]:
+def _frame_key(exposures: pa.Table, frame: Integers) -> dict[str, Any]:
     """Return the key columns of rows of one sensor, by the frame of each."""
     return {
         "sensor_id": pa.repeat(exposures["sensor_id"][0], len(frame)),
@@ -213,7 +208,7 @@ def solutions_table(
 
 def detections_table(
     exposures: pa.Table, c: FlatCentroids, a: StarAttitudes, m: MatchedStars, max_detections: int
-) -> tuple[pa.Table, npt.NDArray[np.int64]]:
+) -> tuple[pa.Table, Integers]:
     """Return DETECTIONS, a row per centroid in the image that is not a star, and the number
     of detections left out of each frame, (F,). There are at most `max_detections` rows.
 
@@ -249,9 +244,7 @@ def detections_table(
     return rows, left_out
 
 
-def rejects_table(
-    exposures: pa.Table, c: FlatCentroids, left_out: npt.NDArray[np.int64]
-) -> pa.Table:
+def rejects_table(exposures: pa.Table, c: FlatCentroids, left_out: Integers) -> pa.Table:
     """Return rows of `rejects`, per log and reason.
 
     They count centroids in frames without a camera, centroids outside the image, and detections
@@ -269,7 +262,7 @@ def rejects_table(
     )
 
 
-def _counted(reason: Reason, exposures: pa.Table, counts: npt.NDArray[np.int64]) -> pa.Table:
+def _counted(reason: Reason, exposures: pa.Table, counts: Integers) -> pa.Table:
     """Return a row of `rejects` per log in which something of a frame was left out."""
     sources, times = array(exposures, "source"), array(exposures, "time")
     rows = []

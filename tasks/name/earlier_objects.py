@@ -9,17 +9,18 @@ from pathlib import Path
 from typing import Literal, NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 import polars as pl
 import pyarrow as pa
 
 from epipole.io.datasets.night_tables import read_columns
+from epipole.schemas.arrays import Array
 from epipole.schemas.bridge import stack_covariance, to_polars
 from epipole.schemas.columns import POSITION, STATE_AXES, VELOCITY
 from epipole.schemas.tables import ORBITS, STATES
 from epipole.tasks.algorithms.constants import DAY_S, GM_KM3_S2, SECOND_NS
 from epipole.tasks.algorithms.orbits.forces import N_UNKNOWNS
 from epipole.tasks.algorithms.orbits.object_linking import ObservedMotions, link_by_motion
+from epipole.tasks.algorithms.orbits.reference_frames import state_rotation
 from epipole.tasks.algorithms.orbits.trajectories import (
     integrate,
     positions_at,
@@ -33,8 +34,6 @@ from epipole.tasks.common.orbit_forces import (
     noon_ns,
     surroundings_of,
 )
-
-Array = npt.NDArray[np.float64]
 
 HOUR_S = 3600.0
 MAX_SIGMA_KM = 100.0  # of a position: vaguer orbits are not moved over hours
@@ -137,7 +136,7 @@ class _Mover:
         noon = noon_ns(str(first))
         self.around = surroundings_of(str(first), int(time_ns.max()) - noon)
         self.epoch_s = (time_ns - noon) / SECOND_NS
-        self.R = np.kron(np.eye(2), self.around.R_night_from_gcrf)
+        self.R = state_rotation(self.around.R_night_from_gcrf)
         motion, cov = motions.tail, motions.tail_cov
         areas = [_areas(*each) for each in zip(motion, rows["forces"], strict=True)]
         self.unknowns = np.concatenate([motion @ self.R.T, [mean for mean, _ in areas]], axis=1)

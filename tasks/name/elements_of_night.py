@@ -1,17 +1,17 @@
 """Element sets of a night: the best one of each object of a catalogue, and its names."""
 
-from collections.abc import Sequence
-from typing import NamedTuple
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 import pyarrow as pa
 
 from epipole.io.catalogues.element_sets import KnownObjects
-from epipole.schemas.bridge import concat
+from epipole.schemas.bridge import concat, table
 from epipole.schemas.rejects import Reason, reject_rows
 from epipole.schemas.spans import DAY_NS
 from epipole.schemas.star_lists import ElementSet, nearest_sets
-from epipole.schemas.tables import REJECTS
+from epipole.schemas.tables import IDENTIFICATIONS, REJECTS
 from epipole.tasks.algorithms.known_objects.prediction import predict, satellites_of
 
 
@@ -86,3 +86,15 @@ def names_of(
         names = " / ".join(sets[row].name or str(sets[row].number) for row in rows)
         return CatalogueNames(name=names, element_epoch=of.epoch_ns)
     return CatalogueNames(element_epoch=of.epoch_ns)
+
+
+def identification_rows(
+    columns: Mapping[str, Any], names: Sequence[CatalogueNames], known: ElementsOfNight | None
+) -> pa.Table:
+    """Return IDENTIFICATIONS of objects or tracklets, not yet compared with earlier nights."""
+    of_catalogue = {
+        field: [getattr(each, field) for each in names] for field in CatalogueNames._fields
+    }
+    sha256 = known.sha256 if known is not None else None
+    rest = {"same_as": [None] * len(names), "catalogue": [sha256] * len(names)}
+    return table(IDENTIFICATIONS, {**columns, **of_catalogue, **rest})

@@ -20,7 +20,6 @@ from epipole.schemas.bridge import (
     rows_with,
     stack,
     stack_covariance,
-    table,
     to_polars,
 )
 from epipole.schemas.columns import POSITION
@@ -29,6 +28,7 @@ from epipole.schemas.settings import KnownObjectSettings
 from epipole.schemas.stages import Stage
 from epipole.schemas.tables import IDENTIFICATIONS
 from epipole.tasks.algorithms.known_objects.matching import (
+    SURE,
     KnownSatellites,
     NameVerdict,
     Observed,
@@ -45,12 +45,16 @@ from epipole.tasks.algorithms.known_objects.prediction import (
 )
 from epipole.tasks.common.stage_tasks import stage_task
 from epipole.tasks.name.earlier_objects import EarlierObjects, recognise_objects
-from epipole.tasks.name.elements_of_night import CatalogueNames, ElementsOfNight, names_of
+from epipole.tasks.name.elements_of_night import (
+    CatalogueNames,
+    ElementsOfNight,
+    identification_rows,
+    names_of,
+)
 from epipole.tasks.name.known_tracklets import name_tracklets, tracklet_rows
 from epipole.tasks.name.sensor_residuals import SensorResidual, sensor_residuals
 
-SURE = 0.999  # probability of a match from which errors are learnt
-COVARIANCE = ["cov_xx", "cov_xy", "cov_xz", "cov_yy", "cov_yz", "cov_zz"]
+_COVARIANCE = ["cov_xx", "cov_xy", "cov_xz", "cov_yy", "cov_yz", "cov_zz"]
 
 
 @stage_task(Stage.NAME, "known objects")
@@ -121,7 +125,7 @@ def observed_objects(folder: Path) -> tuple[dict[str, Observed], dict[str, tuple
         spread = spread_rows(times, rows["independent"].to_numpy())
         chosen.append(rows["row"].to_numpy()[spread].astype(np.int64))
     taken = np.sort(np.concatenate([np.zeros(0, np.int64), *chosen]))
-    columns = ["object_id", "time", *POSITION, *COVARIANCE]
+    columns = ["object_id", "time", *POSITION, *_COVARIANCE]
     rows = take_rows(folder, "positions", columns, taken)
     names, time_ns = array(rows, "object_id"), array(rows, "time")
     r_km, cov = stack(rows, "{}_km"), stack_covariance(rows, "cov_{}")
@@ -205,18 +209,12 @@ def _rows(
         for v in of
     ]
     best = [verdict.best if verdict is not None else None for verdict in of]
-    columns = {field: [getattr(each, field) for each in names] for field in CatalogueNames._fields}
-    return table(
-        IDENTIFICATIONS,
-        columns
-        | {
-            "object_id": list(objects),
-            "tracklet_id": [None] * len(objects),
-            "status": [_status(verdicts, name) for name in objects],
-            "same_as": [None] * len(objects),
-            "distance_km": [each.distance_km if each else None for each in best],
-            "mahalanobis": [each.mahalanobis if each else None for each in best],
-            "probability": [verdict.probability if verdict else None for verdict in of],
-            "catalogue": [known.sha256 if known is not None else None] * len(objects),
-        },
-    )
+    columns = {
+        "object_id": list(objects),
+        "tracklet_id": [None] * len(objects),
+        "status": [_status(verdicts, name) for name in objects],
+        "distance_km": [each.distance_km if each else None for each in best],
+        "mahalanobis": [each.mahalanobis if each else None for each in best],
+        "probability": [verdict.probability if verdict else None for verdict in of],
+    }
+    return identification_rows(columns, names, known)

@@ -9,17 +9,20 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 import polars as pl
 import pyarrow as pa
 
 from epipole.io.datasets.night_tables import read_columns
-from epipole.schemas.bridge import nullable, table
+from epipole.schemas.arrays import Flags, Indices
+from epipole.schemas.bridge import nullable
 from epipole.schemas.columns import ATTRIBUTABLE_AXES, POSITION, VELOCITY, upper_triangle
 from epipole.schemas.rejects import NameStatus
-from epipole.schemas.tables import IDENTIFICATIONS
 from epipole.tasks.algorithms.constants import ARCSEC
-from epipole.tasks.algorithms.known_objects.matching import KnownSatellites, with_learnt_errors
+from epipole.tasks.algorithms.known_objects.matching import (
+    SURE,
+    KnownSatellites,
+    with_learnt_errors,
+)
 from epipole.tasks.algorithms.known_objects.tracklet_matching import (
     PairWeights,
     TrackletNames,
@@ -30,11 +33,13 @@ from epipole.tasks.algorithms.known_objects.tracklet_matching import (
 )
 from epipole.tasks.algorithms.known_objects.tracklet_search import Pairs, SeenTracklets
 from epipole.tasks.common.tracklet_arrays import covariance_of
-from epipole.tasks.name.elements_of_night import CatalogueNames, ElementsOfNight, names_of
+from epipole.tasks.name.elements_of_night import (
+    CatalogueNames,
+    ElementsOfNight,
+    identification_rows,
+    names_of,
+)
 
-Indices = npt.NDArray[np.int64]
-
-SURE = 0.999  # probability of a match from which errors are learnt
 MAX_LEARNT = 300  # tracklets, evenly chosen: they tell the errors to a tenth
 _COVARIANCE = [f"cov_{a}{b}" for a, b in upper_triangle(ATTRIBUTABLE_AXES)]
 _COLUMNS = [
@@ -109,9 +114,7 @@ def sampled_tracklets(folder: Path, most: int) -> SeenTracklets:
     return _tracklets(rows[:: max(-(-len(rows) // most), 1)])
 
 
-def _fits_all(
-    fits: npt.NDArray[np.bool_], pairs: Pairs, rows: pl.DataFrame, compared: Indices
-) -> npt.NDArray[np.bool_]:
+def _fits_all(fits: Flags, pairs: Pairs, rows: pl.DataFrame, compared: Indices) -> Flags:
     """Return which pairs fit; those of an object, whether all its tracklets fit the satellite."""
     members = rows[compared].group_by("object_id").agg(members=pl.len())
     of = rows.select("object_id")[pairs.tracklet].with_columns(satellite=pairs.satellite, fits=fits)
@@ -198,21 +201,10 @@ def tracklet_rows(named: NamedTracklets, known: ElementsOfNight) -> pa.Table:
         else CatalogueNames()
         for k, of, best in zip(named.row.tolist(), status, satellite.tolist(), strict=True)
     ]
-    count = len(names)
+    columns = {"object_id": named.object_id, "tracklet_id": named.tracklet_id, "status": status}
     fitted = {
-        name: np.append(getattr(named.weights, name), np.nan)[pair]
+        name: nullable(np.append(getattr(named.weights, name), np.nan)[pair])
         for name in ("distance_km", "mahalanobis")
     }
-    return table(
-        IDENTIFICATIONS,
-        {field: [getattr(each, field) for each in names] for field in CatalogueNames._fields}
-        | {name: nullable(values) for name, values in fitted.items()}
-        | {
-            "object_id": named.object_id,
-            "tracklet_id": named.tracklet_id,
-            "status": status,
-            "same_as": [None] * count,
-            "probability": named.names.probability[named.row],
-            "catalogue": [known.sha256] * count,
-        },
-    )
+    probability = {"probability": named.names.probability[named.row]}
+    return identification_rows(columns | fitted | probability, names, known)

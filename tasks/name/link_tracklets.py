@@ -10,7 +10,6 @@ from collections.abc import Collection
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 import polars as pl
 import pyarrow as pa
 
@@ -28,9 +27,6 @@ from epipole.tasks.common.tracklet_arrays import (
     attributables_of,
     known_numbers,
 )
-
-Array = npt.NDArray[np.float64]
-Indices = npt.NDArray[np.int64]
 
 # Tracklets that may join an object.
 FREE = (Outcome.UNDECIDED, Outcome.SEEN_BY_ONE, Outcome.NOT_COMPARED)

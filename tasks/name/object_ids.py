@@ -4,12 +4,12 @@ from collections.abc import Iterable, Mapping, Sequence
 from typing import Literal
 
 import numpy as np
-import numpy.typing as npt
 import polars as pl
 import pyarrow as pa
 import pyarrow.compute as pc
 
 from epipole.io.work.work_layout import SolvedParts
+from epipole.schemas.arrays import Array
 from epipole.schemas.bridge import concat, stack_covariance, to_polars
 from epipole.schemas.columns import POSITION, STATE_AXES, VELOCITY
 from epipole.schemas.settings import StateSettings
@@ -20,10 +20,6 @@ from epipole.tasks.algorithms.orbits.object_linking import ObservedMotions, chai
 from epipole.tasks.common.stage_tasks import stage_task
 
 # Objects that are detected again after a gap keep their earlier id.
-
-Array = npt.NDArray[np.float64]
-
-COUNTS = ("n_epochs", "n_views", "dof", "chi2")  # of a state, not of its motion
 
 
 @stage_task(Stage.NAME, "objects")

@@ -9,10 +9,10 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-import numpy.typing as npt
 import polars as pl
 
 from epipole.io.datasets.night_tables import read_columns, take_rows
+from epipole.schemas.arrays import Array
 from epipole.schemas.columns import POSITION, VELOCITY
 from epipole.schemas.star_lists import ElementSet
 from epipole.tasks.algorithms.known_objects.matching import spread_rows
@@ -21,8 +21,6 @@ from epipole.tasks.algorithms.known_objects.prediction import (
     satellites_of,
     track_residuals,
 )
-
-Array = npt.NDArray[np.float64]
 
 AXES = ("along", "across")
 

@@ -4,12 +4,12 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
-import numpy.typing as npt
 import polars as pl
 import pyarrow as pa
 
 from epipole.io.datasets.night_tables import NightReader, rewrite_table
 from epipole.io.work.parts import FITTED, read_part, write_part
+from epipole.schemas.arrays import Array, Integers
 from epipole.schemas.bridge import array, from_polars, nullable, table, to_polars
 from epipole.schemas.columns import POSITION
 from epipole.schemas.observation import FITTED_FIELDS
@@ -23,8 +23,6 @@ from epipole.tasks.algorithms.orbits.orbit_determination import BACK_S
 from epipole.tasks.algorithms.orbits.trajectories import integrate, positions_at
 from epipole.tasks.common.stage_tasks import stage_task
 from epipole.tasks.publish.object_orbits import FittedOrbit, turned
-
-Array = npt.NDArray[np.float64]
 
 MAX_APART_S = 30.0  # positions between which a straight line is right: within 1 km in low orbit
 LIGHT_ITERATIONS = 3  # right to 1e-12 of the distance
@@ -82,7 +80,7 @@ def write_fitted(
     write_part(part, FITTED, {"observations": table(FITTED_OBSERVATIONS, columns)})
 
 
-def _times(rows: pl.DataFrame) -> npt.NDArray[np.int64]:
+def _times(rows: pl.DataFrame) -> Integers:
     return rows["time"].cast(pl.Int64).to_numpy()
 
 
@@ -98,9 +96,7 @@ def _by_orbit(fitted: FittedOrbit, time_s: Array, sensor_km: Array, around: Surr
     return r_km
 
 
-def _by_positions(
-    positions: pl.DataFrame, time_ns: npt.NDArray[np.int64], sensor_km: Array
-) -> Array:
+def _by_positions(positions: pl.DataFrame, time_ns: Integers, sensor_km: Array) -> Array:
     """Return the same between positions; NaN where none are near."""
     solved_ns = _times(positions)
     solved_s, time_s = ((t - solved_ns[0]) / SECOND_NS for t in (solved_ns, time_ns))

@@ -7,9 +7,9 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 from scipy.optimize import minimize_scalar
 
+from epipole.schemas.arrays import Array
 from epipole.tasks.algorithms.constants import SECOND_NS
 from epipole.tasks.algorithms.orbits.forces import Surroundings
 from epipole.tasks.algorithms.orbits.orbit_determination import (
@@ -17,17 +17,15 @@ from epipole.tasks.algorithms.orbits.orbit_determination import (
     ObjectDirections,
     part_of,
 )
+from epipole.tasks.algorithms.orbits.reference_frames import state_rotation
 from epipole.tasks.algorithms.orbits.trajectories import propagate_unknowns
 from epipole.tasks.publish.object_orbits import (
     FittedOrbit,
     Start,
     best_orbit,
-    both,
     judge,
     turned,
 )
-
-Array = npt.NDArray[np.float64]
 
 MIN_PART = 8  # directions on each side of the change
 COARSE = 8  # cuts that are tried at first, evenly among the directions
@@ -68,7 +66,7 @@ def find_manoeuvre(
     n = len(directions.time_s)
     if n < 2 * MIN_PART:
         return None
-    R = both(around.R_night_from_gcrf.T)
+    R = state_rotation(around.R_night_from_gcrf.T)
     start = Start(
         origin_ns + round(misfit.epoch_s * SECOND_NS), turned(R, misfit.orbit.unknowns[:6])
     )

@@ -5,12 +5,12 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 import pyarrow as pa
 
 from epipole.io.datasets.dataset import publish_folders
 from epipole.io.datasets.night_tables import ROWS_IN_GROUP
 from epipole.io.work.work_layout import SensorParts, SolvedParts
+from epipole.schemas.arrays import Integers
 from epipole.schemas.bridge import array
 from epipole.schemas.settings import TableSettings
 from epipole.schemas.spans import Span
@@ -93,7 +93,7 @@ def in_slices(
         ]
 
 
-def _edges(times: Sequence[npt.NDArray[np.int64]], span: Span, limit: int) -> npt.NDArray[np.int64]:
+def _edges(times: Sequence[Integers], span: Span, limit: int) -> Integers:
     """Return the times that bound slices of a span, with at most about `limit` rows each."""
     together = np.concatenate([np.zeros(0, np.int64), *times])
     inside = together[(together >= span.start_ns) & (together < span.end_ns)]
@@ -103,9 +103,7 @@ def _edges(times: Sequence[npt.NDArray[np.int64]], span: Span, limit: int) -> np
     return np.array([span.start_ns, *between[between > span.start_ns], span.end_ns], np.int64)
 
 
-def _rows(
-    read: Callable[[], pa.Table], order: npt.NDArray[np.int64] | None, first: int, last: int
-) -> pa.Table:
+def _rows(read: Callable[[], pa.Table], order: Integers | None, first: int, last: int) -> pa.Table:
     """Return a copy of some rows: of a file that is mapped into memory, only these are kept."""
     rows = np.arange(first, last) if order is None else order[first:last]
     return read().take(rows)

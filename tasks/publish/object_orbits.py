@@ -4,10 +4,10 @@ from collections.abc import Mapping
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 import polars as pl
 from scipy.special import chdtrc
 
+from epipole.schemas.arrays import Array, Integers
 from epipole.schemas.columns import POSITION
 from epipole.schemas.rejects import Reason
 from epipole.schemas.work_tables import SHARED_OBSERVATIONS
@@ -26,6 +26,7 @@ from epipole.tasks.algorithms.orbits.orbit_determination import (
     log_evidence,
     neglected,
 )
+from epipole.tasks.algorithms.orbits.reference_frames import state_rotation
 from epipole.tasks.common.grouping import factorize, group_offsets
 from epipole.tasks.common.orbit_forces import (
     AIR_AREA,
@@ -36,8 +37,6 @@ from epipole.tasks.common.orbit_forces import (
     is_sunlit,
 )
 from epipole.tasks.publish.sensor_errors import SensorSums, summed_equations
-
-Array = npt.NDArray[np.float64]
 
 MIN_PROBABILITY = 1e-6  # of a chi-square: an orbit with a less probable one is rejected
 MIN_BIAS_ARCSEC = 1e-3  # keeps the prior invertible if nothing is shared
@@ -67,11 +66,6 @@ def turned(rotation: Array, vectors: Array) -> Array:
     return out
 
 
-def both(rotation: Array) -> Array:
-    """Return the (6, 6) rotation of positions and velocities."""
-    return np.asarray(np.kron(np.eye(2), rotation), float)
-
-
 class FittedOrbit(NamedTuple):
     """An orbit at its epoch [s] after the noon of the night, with the names of its forces."""
 
@@ -96,9 +90,9 @@ class ObservedObjects(NamedTuple):
 
     names: list[str]
     sensors: list[str]
-    offsets: npt.NDArray[np.int64]
-    time_ns: npt.NDArray[np.int64]
-    tracklet: npt.NDArray[np.int64]
+    offsets: Integers
+    time_ns: Integers
+    tracklet: Integers
     views: ObjectDirections
     cov_shared: Array
 
@@ -184,7 +178,7 @@ def best_orbit(
     """
     found = None
     if start is not None:
-        state = turned(both(around.R_night_from_gcrf), start.state)
+        state = turned(state_rotation(around.R_night_from_gcrf), start.state)
         found = _from_state(directions, state, (start.time_ns - origin_ns) / SECOND_NS, around)
     if found is None and (initial := initial_orbit(directions, around)) is not None:
         found = _from_state(directions, *initial, around)

@@ -5,13 +5,13 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 import polars as pl
 import pyarrow as pa
 import pyarrow.compute as pc
 
 from epipole.io.datasets.night_tables import NightReader, read_columns, write_table
 from epipole.io.datasets.rows_by_night import in_order
+from epipole.schemas.arrays import Array
 from epipole.schemas.bridge import (
     concat,
     nullable,
@@ -33,6 +33,7 @@ from epipole.tasks.algorithms.orbits.orbital_elements import (
     elements_of,
     geostationary,
 )
+from epipole.tasks.algorithms.orbits.reference_frames import state_rotation
 from epipole.tasks.common.orbit_forces import noon_ns, surroundings_of
 from epipole.tasks.common.stage_tasks import stage_task
 from epipole.tasks.publish.fitted_observations import fitted_part, write_fitted
@@ -42,15 +43,12 @@ from epipole.tasks.publish.object_orbits import (
     ObservedObjects,
     Start,
     best_orbit,
-    both,
     judge,
     observed_objects,
     turned,
 )
 from epipole.tasks.publish.sensor_errors import SensorSums, sensor_errors
 from epipole.tasks.publish.share_out import of_share
-
-Array = npt.NDArray[np.float64]
 
 ROWS_OF_TASK = 300_000  # observations, about
 OF_ORBITS = (Reason.MANOEUVRE, Reason.ORBIT_MISFIT, Reason.NO_ORBIT)
@@ -195,7 +193,7 @@ def orbit_table(
 ) -> pa.Table:
     """Return ORBITS of objects, given by their numbers."""
     rows, fitted, n = list(orbits), list(orbits.values()), len(orbits)
-    turn = both(around.R_night_from_gcrf.T)
+    turn = state_rotation(around.R_night_from_gcrf.T)
     state = turned(turn, np.array([each.orbit.unknowns[:6] for each in fitted]).reshape(n, 6))
     cov = np.array([turn @ each.orbit.cov[:6, :6] @ turn.T for each in fitted]).reshape(n, 6, 6)
     used = [np.flatnonzero(each.orbit.used) for each in fitted]

@@ -4,13 +4,14 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 import pyarrow as pa
 
+from epipole.schemas.arrays import Array, Indices
 from epipole.schemas.bridge import table, unstack, unstack_covariance
 from epipole.schemas.columns import SHARED_AXES
 from epipole.schemas.tables import SENSOR_ERRORS
 from epipole.tasks.algorithms.constants import ARCSEC
+from epipole.tasks.algorithms.orbits.reference_frames import state_rotation
 from epipole.tasks.algorithms.orbits.sensor_biases import (
     SensorEquations,
     added,
@@ -18,9 +19,6 @@ from epipole.tasks.algorithms.orbits.sensor_biases import (
     solve_biases,
 )
 from epipole.tasks.algorithms.orbits.shared_errors import ArcEquations
-
-Array = npt.NDArray[np.float64]
-Indices = npt.NDArray[np.int64]
 
 UNITS = np.array([ARCSEC] * 3 + [1.0] * 3)  # of the direction and the position
 
@@ -80,7 +78,7 @@ def sensor_errors(sums: Sequence[SensorSums], R_night_from_gcrf: Array) -> pa.Ta
     parts = [(rows, each.equations) for rows, each in zip(at, sums, strict=True)]
     bias, cov = solve_biases(added(parts, len(names)), np.repeat(prior, 3, axis=1))
     used = np.flatnonzero((counts[:, 0] > 0) & np.isfinite(bias).all(axis=1))
-    turn = np.kron(np.eye(2), R_night_from_gcrf.T) / UNITS[:, None]
+    turn = state_rotation(R_night_from_gcrf.T) / UNITS[:, None]
     bias, cov = bias[used] @ turn.T, turn @ cov[used] @ turn.T
     return table(
         SENSOR_ERRORS,

@@ -3,16 +3,14 @@
 from collections.abc import Iterable, Sequence
 
 import numpy as np
-import numpy.typing as npt
 import pyarrow as pa
 
+from epipole.schemas.arrays import Flags, Nanoseconds
 from epipole.schemas.bridge import array
 from epipole.schemas.settings import EVERY_SENSOR, Assumption
 from epipole.schemas.work_tables import LogPiece, LogSource
 from epipole.tasks.algorithms.constants import SECOND_NS
 from epipole.tasks.algorithms.times import tai_minus_utc_s, utc_julian_date
-
-Nanoseconds = npt.NDArray[np.int64]
 
 TAI_MINUS_GPS_S = 19.0  # since 1980: GPS times have no leap seconds
 VELOCITIES = ("vx_km_s", "vy_km_s", "vz_km_s")
@@ -63,7 +61,7 @@ def _ahead_ns(time_ns: Nanoseconds, assumed: Assumption) -> Nanoseconds:
     return np.round(ahead_s * SECOND_NS).astype(np.int64)
 
 
-def _of_sensor(rows: pa.Table, assumed: Assumption) -> npt.NDArray[np.bool_]:
+def _of_sensor(rows: pa.Table, assumed: Assumption) -> Flags:
     if assumed.sensor == EVERY_SENSOR:
         return np.ones(rows.num_rows, bool)
     return np.asarray(array(rows, "sensor_id") == assumed.sensor)
@@ -91,7 +89,7 @@ def _with_line_time(cameras: pa.Table, assumed: Assumption) -> pa.Table:
     return _with_column(cameras, "line_time_s", pa.array(line_time_s))
 
 
-def without_velocities(states: pa.Table, rows: npt.NDArray[np.bool_] | None = None) -> pa.Table:
+def without_velocities(states: pa.Table, rows: Flags | None = None) -> pa.Table:
     """Return states of which those of some rows, or all, have no velocity."""
     of_rows = np.ones(states.num_rows, bool) if rows is None else rows
     for name in VELOCITIES:

@@ -5,11 +5,11 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 import pyarrow as pa
 import pyarrow.compute as pc
 
 from epipole.io.work.parts import read_part
+from epipole.schemas.arrays import Integers
 from epipole.schemas.bridge import array, concat, flatten, nullable, rows_with, stack, table
 from epipole.schemas.log_checks import LogCause, LogCheck
 from epipole.schemas.rejects import Reason
@@ -38,8 +38,6 @@ from epipole.tasks.algorithms.log_checks.states import LogStates, check_states
 from epipole.tasks.common.batches import Batch
 from epipole.tasks.common.stage_tasks import stage_task
 from epipole.tasks.read.order_frames import OrderedFrames
-
-Integers = npt.NDArray[np.int64]
 
 MAX_SAMPLED = 100  # frames of which centroids are looked at
 SAME_TIME_NS = SECOND_NS  # calibrations of one time

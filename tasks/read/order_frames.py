@@ -12,13 +12,13 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 import pyarrow as pa
 import pyarrow.compute as pc
 
 from epipole.io.logs.left_out import frames_left_out, stray_rejects
 from epipole.io.work.parts import READ_SENSOR, read_part, write_part
 from epipole.io.work.work_layout import ReadFolder
+from epipole.schemas.arrays import Indices
 from epipole.schemas.bridge import array, concat, conform, rows_with, table, unstack_covariance
 from epipole.schemas.columns import OPTICS_AXES
 from epipole.schemas.rejects import Reason, reject_rows
@@ -43,7 +43,6 @@ from epipole.tasks.read.states_to_gcrf import states_to_gcrf
 
 LOGGER = logging.getLogger(__name__)
 
-Indices = npt.NDArray[np.int64]
 
 _DUPLICATES = {
     DUPLICATE_FRAME: Reason.DUPLICATE_FRAME,

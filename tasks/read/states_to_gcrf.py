@@ -3,10 +3,10 @@
 import logging
 
 import numpy as np
-import numpy.typing as npt
 import pyarrow as pa
 
 from epipole.io.catalogues.earth_orientation import read_earth_orientation
+from epipole.schemas.arrays import Array
 from epipole.schemas.bridge import array, nullable, stack, table, unstack
 from epipole.schemas.work_tables import ITRF, SENSOR_STATES
 from epipole.tasks.algorithms.orbits.reference_frames import orientation_at, to_gcrf
@@ -38,7 +38,7 @@ def states_to_gcrf(states: pa.Table, unknown_sigma_km: float) -> pa.Table:
     return table(SENSOR_STATES, values)
 
 
-def _warn_of_orientation(turn_km: npt.NDArray[np.float64]) -> None:
+def _warn_of_orientation(turn_km: Array) -> None:
     end = np.datetime64("1858-11-17") + int(read_earth_orientation().mjd[-1])
     LOGGER.warning(
         "%d ITRF states lie outside the Earth-orientation table, which ends %s; their positions "

@@ -16,8 +16,8 @@ from typing import Any
 from xml.etree import ElementTree
 
 import numpy as np
-import numpy.typing as npt
 
+from epipole.schemas.arrays import Array
 from epipole.schemas.errors import ReportError
 from epipole.schemas.text import as_line
 
@@ -265,7 +265,7 @@ def legend_below(figure: Figure, axes: Axes, columns: int = 3) -> None:
                       columnspacing=1.2, handletextpad=0.5)  # fmt: skip
 
 
-def as_image(axes: Axes, size_px: npt.NDArray[np.float64]) -> None:
+def as_image(axes: Axes, size_px: Array) -> None:
     """Make axes an image: rows go down, square pixels."""
     margin = 0.02 * max(size_px)
     axes.set(xlim=(-margin, size_px[0] + margin), ylim=(size_px[1] + margin, -margin))

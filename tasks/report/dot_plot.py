@@ -9,12 +9,10 @@ from typing import NamedTuple
 from xml.sax.saxutils import escape, quoteattr
 
 import numpy as np
-import numpy.typing as npt
 
+from epipole.schemas.arrays import Array
 from epipole.schemas.text import as_line
 from epipole.tasks.report.canvas import COLOURS, LINES, LONGEST_TEXT, clock_ticks, short
-
-Array = npt.NDArray[np.float64]
 
 WIDTH, HEIGHT = 266.0, 150.0  # [pt], as wide as the other pictures
 LEFT, RIGHT, TOP, BOTTOM = 34.0, 6.0, 6.0, 40.0  # margins

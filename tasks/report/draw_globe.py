@@ -8,14 +8,12 @@ from typing import NamedTuple
 from xml.sax.saxutils import quoteattr
 
 import numpy as np
-import numpy.typing as npt
 
+from epipole.schemas.arrays import Array, Flags
 from epipole.schemas.text import as_line
 from epipole.tasks.algorithms.constants import EARTH_RADIUS_KM
 from epipole.tasks.report.canvas import LONGEST_TEXT
 from epipole.tasks.report.globe import Globe, Sight
-
-Array = npt.NDArray[np.float64]
 
 SIZE_PT = 266.0  # as wide as the other pictures
 MARGIN_PT = 8.0
@@ -32,7 +30,7 @@ class _Side(NamedTuple):
     latitude: float
     scale: float
 
-    def project(self, r_km: Array) -> tuple[Array, npt.NDArray[np.bool_]]:
+    def project(self, r_km: Array) -> tuple[Array, Flags]:
         """Return points of the picture (n, 2), and which are before the Earth or beside it."""
         lon, lat = np.radians([self.longitude, self.latitude])
         right = np.array([-np.sin(lon), np.cos(lon), 0.0])

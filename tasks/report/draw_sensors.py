@@ -3,11 +3,11 @@
 from collections.abc import Mapping, Sequence
 
 import numpy as np
-import numpy.typing as npt
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
+from epipole.schemas.arrays import Array, Flags
 from epipole.tasks.report.canvas import (
     BLACK,
     BLUE,
@@ -31,7 +31,6 @@ from epipole.tasks.report.stars import CELLS, StarMap, StarResiduals
 
 # In the image of a sensor.
 
-Array = npt.NDArray[np.float64]
 
 IMAGE_IN = 4.1  # height of a picture of an image
 MAX_NAMES = 30
@@ -137,7 +136,7 @@ def draw_image_residuals(figure: Figure, residuals: StarResiduals, k: int) -> No
     legend_below(figure, axes, columns=2)
 
 
-def image_pattern(residuals: StarResiduals, k: int) -> tuple[Array, npt.NDArray[np.bool_]]:
+def image_pattern(residuals: StarResiduals, k: int) -> tuple[Array, Flags]:
     """Return (cells, 2) mean residuals, NaN with few stars, and which are more than chance."""
     count = residuals.in_cell[k].ravel()
     mean = np.where(count[:, None] >= MIN_IN_CELL, residuals.mean_px[k].reshape(-1, 2), np.nan)

@@ -3,10 +3,10 @@
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 import polars as pl
 
 from epipole.io.datasets.night_tables import NightReader
+from epipole.schemas.arrays import Array
 from epipole.schemas.columns import POSITION, VELOCITY
 from epipole.tasks.algorithms.constants import SPEED_OF_LIGHT_KM_S
 from epipole.tasks.algorithms.geometry.camera import Camera, distort, project, unproject
@@ -17,8 +17,6 @@ from epipole.tasks.algorithms.geometry.directions import (
     unit_from_radec,
 )
 from epipole.tasks.algorithms.geometry.epipolar import epipolar_angle
-
-Array = npt.NDArray[np.float64]
 
 MAX_LINES = 12
 MAX_PAIRS = 3  # of sensors that are tried

@@ -4,14 +4,13 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 import polars as pl
 
 from epipole.io.datasets.night_tables import NightReader
+from epipole.schemas.arrays import Array, Flags, Indices
 
 # Bins of time: about a hundred per night, however many frames it has.
 
-Indices = npt.NDArray[np.int64]
 
 MAX_BINS = 96
 MIN_BINS = 8
@@ -26,7 +25,7 @@ class TimeBins(NamedTuple):
     number: int
 
     @property
-    def edges_s(self) -> npt.NDArray[np.float64]:
+    def edges_s(self) -> Array:
         """The (number + 1,) edges, in seconds since 0 h of the first day."""
         edges = np.linspace(0.0, (self.end_ns - self.start_ns) / 1e9, self.number + 1)
         return seconds_of_day(np.array([self.start_ns])) + edges
@@ -43,9 +42,9 @@ def bins_between(start_ns: int, end_ns: int, frames_of_busiest: int) -> TimeBins
     return TimeBins(start_ns, end_ns + 1, count)
 
 
-def seconds_of_day(time_ns: Indices) -> npt.NDArray[np.float64]:
+def seconds_of_day(time_ns: Indices) -> Array:
     """Return the seconds since 0 h UTC of each time's day."""
-    seconds: npt.NDArray[np.float64] = (time_ns % 86_400_000_000_000) / 1e9
+    seconds: Array = (time_ns % 86_400_000_000_000) / 1e9
     return seconds
 
 
@@ -56,7 +55,6 @@ def clock(time_ns: int) -> str:
 
 # Frames in these bins.
 
-Array = npt.NDArray[np.float64]
 
 COLUMNS = ["time", "sensor_id", "attitude_source", "status", "n_stars", "n_centroids",
            "sigma_x_arcsec", "sigma_y_arcsec", "sigma_z_arcsec", "residual_px"]  # fmt: skip
@@ -118,7 +116,7 @@ class FrameSeries:
         return share
 
     @property
-    def sends_no_stars(self) -> npt.NDArray[np.bool_]:
+    def sends_no_stars(self) -> Flags:
         """Which sensors send attitudes in place of stars, and hardly a centroid."""
         by_source = self.counts.sum(axis=2)
         return (by_source[1] == self.frames) & (self.centroids < FEW_CENTROIDS)

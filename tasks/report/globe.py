@@ -3,16 +3,14 @@
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 import polars as pl
 
 from epipole.io.datasets.night_tables import NightReader
+from epipole.schemas.arrays import Array
 from epipole.schemas.columns import POSITION, VELOCITY
 from epipole.tasks.algorithms.constants import SECOND_NS
 from epipole.tasks.algorithms.geometry.directions import unit_from_radec
 from epipole.tasks.algorithms.orbits.orbit_fit import propagate
-
-Array = npt.NDArray[np.float64]
 
 NEAR_NS = 60 * SECOND_NS  # frames so near to the time say where a sensor is
 SEEN_NS = 15 * SECOND_NS  # observations so near to it are drawn

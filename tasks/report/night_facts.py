@@ -8,10 +8,10 @@ from statistics import median
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 import polars as pl
 
 from epipole.io.datasets.night_tables import NightReader
+from epipole.schemas.arrays import Flags
 from epipole.schemas.log_checks import MISTAKE_COLUMNS, mistakes
 from epipole.schemas.rejects import NameStatus, ObjectVerdict, Reason, Trait
 from epipole.schemas.stages import Stage
@@ -252,7 +252,7 @@ def _sensors(facts: NightFacts) -> Iterator[Look]:
         yield Look(f"{name}: {identified}.", _frame_of(facts, name, "coverage"))
 
 
-def _is_poor(series: FrameSeries) -> npt.NDArray[np.bool_]:
+def _is_poor(series: FrameSeries) -> Flags:
     """Return which sensors' frames are identified more rarely than they should be."""
     return (series.identified_share < MIN_IDENTIFIED) & ~series.sends_no_stars
 

@@ -6,10 +6,10 @@ from typing import Any, NamedTuple
 
 import erfa
 import numpy as np
-import numpy.typing as npt
 import polars as pl
 
 from epipole.io.datasets.night_tables import NightReader
+from epipole.schemas.arrays import Array
 from epipole.schemas.columns import POSITION
 from epipole.schemas.errors import DatasetError
 from epipole.schemas.rejects import NameStatus, Outcome
@@ -18,7 +18,6 @@ from epipole.tasks.report.frame_series import clock
 
 # Objects: where they are, how they move, and what is known of their names.
 
-Array = npt.NDArray[np.float64]
 Geography = tuple[float, float, float]
 
 GEOSTATIONARY_KM = 42_164.0

@@ -3,12 +3,9 @@
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
 from epipole.io.datasets.night_tables import NightReader
-
-Array = npt.NDArray[np.float64]
-Indices = npt.NDArray[np.int64]
+from epipole.schemas.arrays import Array, Indices
 
 PAIR_BINS = np.linspace(0.0, 5.0, 26)  # edges, in sigmas
 MIN_BINS, MAX_BINS = 8, 40

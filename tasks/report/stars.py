@@ -3,17 +3,15 @@
 from typing import Any, NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 import polars as pl
 
 from epipole.io.datasets.night_tables import NightReader
+from epipole.schemas.arrays import Array, Flags, Indices
 from epipole.tasks.algorithms.constants import ARCSEC
 from epipole.tasks.report.frame_series import FrameSeries, codes
 
 # Residuals.
 
-Array = npt.NDArray[np.float64]
-Indices = npt.NDArray[np.int64]
 
 COLUMNS = ["time", "sensor_id", "x_px", "y_px", "dx_px", "dy_px"]
 HISTOGRAM = np.linspace(-5.0, 5.0, 51)  # edges, in sigmas
@@ -173,7 +171,7 @@ class StarMap(NamedTuple):
     stars_px: Array
     residuals_px: Array
     others_px: Array
-    objects: npt.NDArray[np.bool_]
+    objects: Flags
     says: list[str]
     others_say: list[str]
     status: str | None = None

@@ -6,9 +6,9 @@ from datetime import UTC, datetime
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
 from epipole.io.simulation.scenes import read_element_sets
+from epipole.schemas.arrays import Array
 from epipole.schemas.errors import SceneError
 from epipole.schemas.scene import Orbit, Scene, SceneTargets
 from epipole.schemas.star_lists import ElementSet, nearest_sets
@@ -42,7 +42,6 @@ from epipole.tasks.algorithms.simulation.sources import SimulatedObjects
 
 # Orbits: elements, positions, random ones, and objects near them.
 
-Array = npt.NDArray[np.float64]
 
 NO_SENSOR = 1_000_000  # first index of the random streams that belong to no sensor
 

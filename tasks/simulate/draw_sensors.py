@@ -7,8 +7,8 @@ from functools import partial
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
+from epipole.schemas.arrays import Array
 from epipole.schemas.errors import SceneError
 from epipole.schemas.scene import Scene, SceneCamera, SceneSensor
 from epipole.schemas.star_lists import ElementSet
@@ -63,7 +63,6 @@ def true_optics(camera: SceneCamera) -> TrueOptics:
 
 # Sensors.
 
-Array = npt.NDArray[np.float64]
 
 _DRAWS = 10_000  # of a random orbit from which the tracked object is visible
 

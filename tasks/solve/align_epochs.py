@@ -4,10 +4,10 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 import pyarrow as pa
 import pyarrow.compute as pc
 
+from epipole.schemas.arrays import Integers
 from epipole.schemas.bridge import array, concat, rows_with, table
 from epipole.schemas.settings import AlignmentSettings
 from epipole.schemas.tables import EPOCHS
@@ -27,7 +27,7 @@ class EpochGrid(NamedTuple):
     epochs_ns: tuple[int, ...] | None  # the epochs, if no sensor has a frame interval
 
 
-def night_grid(time_ns: Sequence[npt.NDArray[np.int64]], settings: AlignmentSettings) -> EpochGrid:
+def night_grid(time_ns: Sequence[Integers], settings: AlignmentSettings) -> EpochGrid:
     """Return a night's grid of epochs.
 
     Parameters
@@ -80,10 +80,10 @@ def align_epochs(
 
 
 def _nearest_frames(
-    epochs: npt.NDArray[np.int64],
+    epochs: Integers,
     sensor: str,
-    frame_number: npt.NDArray[np.int64],
-    time_ns: npt.NDArray[np.int64],
+    frame_number: Integers,
+    time_ns: Integers,
     interval_ns: int,
     settings: AlignmentSettings,
 ) -> pa.Table:

@@ -12,6 +12,7 @@ import numpy as np
 import numpy.typing as npt
 import pyarrow as pa
 
+from epipole.schemas.arrays import Array, Flags, Indices
 from epipole.schemas.bridge import concat
 from epipole.schemas.options import ASSOCIATION, load_method
 from epipole.schemas.rejects import Reason, reject_rows
@@ -29,8 +30,6 @@ from epipole.tasks.solve.association_input import BlockViews, SampledViews, even
 
 LOGGER = logging.getLogger(__name__)
 
-Indices = npt.NDArray[np.int64]
-Flags = npt.NDArray[np.bool_]
 
 LONGER_WINDOWS_S = (120.0, 600.0)  # of windows for undecided tracklets; each divides a span
 # Part of a window for which a tracklet is seen briefly: alone, it shows too little. Found epochs
@@ -281,7 +280,7 @@ def _reject_table(block: BlockViews, reason: Reason, left_out: Indices) -> pa.Ta
 
 
 def associate_by_likelihood(
-    samples: Samples, focal_px: npt.NDArray[np.float64], settings: AssociationSettings
+    samples: Samples, focal_px: Array, settings: AssociationSettings
 ) -> Groups:
     """Return the groups of tracklets that are most likely one object each."""
     return associate_tracklets(
@@ -296,7 +295,7 @@ def associate_by_likelihood(
 
 
 def associate_by_epipolar_lines(
-    samples: Samples, focal_px: npt.NDArray[np.float64], settings: AssociationSettings
+    samples: Samples, focal_px: Array, settings: AssociationSettings
 ) -> Groups:
     """Return the groups of tracklets that lie on each other's epipolar lines [published]."""
     return associate_by_lines(samples, focal_px, settings.threshold_px)

@@ -13,9 +13,9 @@ from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 import pyarrow as pa
 
+from epipole.schemas.arrays import Array, Flags, Indices
 from epipole.schemas.bridge import array, stack, stack_covariance
 from epipole.schemas.columns import TANGENT_AXES
 from epipole.schemas.spans import Span
@@ -25,9 +25,6 @@ from epipole.tasks.algorithms.association.window_groups import Items
 from epipole.tasks.algorithms.geometry.directions import matrix_from_quaternion
 from epipole.tasks.common.grouping import group_offsets
 from epipole.tasks.common.sightings import camera_of
-
-Indices = npt.NDArray[np.int64]
-Flags = npt.NDArray[np.bool_]
 
 # Instants.
 
@@ -98,7 +95,6 @@ def with_ends(even: Indices, epochs: Indices, first: Indices, last: Indices) -> 
 
 # Sensor poses.
 
-Array = npt.NDArray[np.float64]
 
 NEAR_S = 2.0  # a frame within this time of an epoch gives the sensor's pose
 
@@ -423,7 +419,7 @@ class SampledViews:
         ), tracklet
 
 
-def _repeated(seen: npt.NDArray[np.bool_], time_s: Array, width_s: Array) -> Array:
+def _repeated(seen: Flags, time_s: Array, width_s: Array) -> Array:
     """Return how many samples of its tracklet each sample repeats, itself included, (t, k).
 
     Samples that are fitted to the same detections share their errors. With this factor on the noise

@@ -7,12 +7,12 @@ data and the settings only, never on the workers.
 from collections.abc import Sequence
 
 import numpy as np
-import numpy.typing as npt
 import polars as pl
 import pyarrow as pa
 
 from epipole.io.work.parts import NUMBERED, Parts, write_part
 from epipole.io.work.work_layout import SolvedParts
+from epipole.schemas.arrays import Indices
 from epipole.schemas.bridge import from_polars, to_polars
 from epipole.schemas.settings import AssociationSettings
 from epipole.schemas.spans import Span
@@ -21,8 +21,6 @@ from epipole.schemas.work_tables import OBJECT_MEMBERS
 from epipole.tasks.algorithms.orbits.object_motion import ObjectRegistry
 from epipole.tasks.common.stage_tasks import stage_task
 from epipole.tasks.solve.associate_block import blocks_of
-
-Indices = npt.NDArray[np.int64]
 
 
 @stage_task(Stage.SOLVE, "numbers of objects")

@@ -1,9 +1,9 @@
 """Pair views: how far the views of an object at an epoch lie from each other's epipolar lines."""
 
 import numpy as np
-import numpy.typing as npt
 import pyarrow as pa
 
+from epipole.schemas.arrays import Array, Flags, Indices
 from epipole.schemas.bridge import table
 from epipole.schemas.tables import ASSOCIATIONS, PAIRS
 from epipole.tasks.algorithms.geometry.directions import tangent_basis
@@ -15,9 +15,6 @@ from epipole.tasks.algorithms.geometry.epipolar import (
 )
 from epipole.tasks.common.sightings import published_ids
 from epipole.tasks.solve.view_groups import ViewGroups
-
-Array = npt.NDArray[np.float64]
-Indices = npt.NDArray[np.int64]
 
 MAX_OTHERS = 8  # views from which a view's epipolar distance is taken: those of least error
 
@@ -76,9 +73,7 @@ def _position_error(groups: ViewGroups) -> Array:
     return across * range_km**2 + views.sigma_km**2
 
 
-def _with_reference(
-    groups: ViewGroups, candidates: npt.NDArray[np.bool_]
-) -> tuple[Indices, Indices]:
+def _with_reference(groups: ViewGroups, candidates: Flags) -> tuple[Indices, Indices]:
     """Return each candidate's reference view, and the candidate."""
     error = np.where(candidates, _position_error(groups), np.inf)
     order = np.lexsort((error, groups.group))
@@ -87,7 +82,7 @@ def _with_reference(
     return reference[second], second
 
 
-def _every_two(group: Indices, candidates: npt.NDArray[np.bool_]) -> tuple[Indices, Indices]:
+def _every_two(group: Indices, candidates: Flags) -> tuple[Indices, Indices]:
     """Return every two candidates of a group; their number grows with the square of the views."""
     rows = np.flatnonzero(candidates)
     pairs = [np.zeros((0, 2), np.int64)]

@@ -4,6 +4,7 @@ import numpy as np
 import numpy.typing as npt
 import pyarrow as pa
 
+from epipole.schemas.arrays import Array, Flags, Indices
 from epipole.schemas.bridge import array, concat, table, unstack, unstack_covariance
 from epipole.schemas.rejects import Reason, reject_rows
 from epipole.schemas.spans import Span
@@ -18,9 +19,6 @@ from epipole.tasks.algorithms.orbits.object_motion import (
 from epipole.tasks.common.grouping import group_offsets
 from epipole.tasks.common.sightings import only_id
 from epipole.tasks.solve.view_groups import ObjectViews, ViewGroups
-
-Array = npt.NDArray[np.float64]
-Indices = npt.NDArray[np.int64]
 
 VELOCITY_WINDOW_S = 30.0  # positions within this time give an object's velocity
 
@@ -117,7 +115,7 @@ def with_neglected_motion(
     return views._replace(u=u, cov_noise=cov, unmodelled=neglected - removed)
 
 
-def _independent(groups: ViewGroups, span: Span | None) -> npt.NDArray[np.bool_]:
+def _independent(groups: ViewGroups, span: Span | None) -> Flags:
     """Return groups of which no two share a detection: in order of time, each group that shares no
     detection with those chosen before.
 

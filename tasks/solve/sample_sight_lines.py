@@ -8,6 +8,7 @@ import numpy.typing as npt
 import polars as pl
 import pyarrow as pa
 
+from epipole.schemas.arrays import Indices
 from epipole.schemas.bridge import (
     array,
     conform,
@@ -25,9 +26,6 @@ from epipole.tasks.algorithms.geometry.directions import apparent_positions
 from epipole.tasks.algorithms.orbits.object_motion import velocities
 from epipole.tasks.solve.positions import VELOCITY_WINDOW_S
 from epipole.tasks.solve.view_groups import ObjectViews, ViewGroups
-
-Array = npt.NDArray[np.float64]
-Indices = npt.NDArray[np.int64]
 
 
 class LineSampling(NamedTuple):

@@ -11,6 +11,7 @@ import numpy as np
 import numpy.typing as npt
 import pyarrow as pa
 
+from epipole.schemas.arrays import Array, Indices
 from epipole.schemas.bridge import array, empty, nullable, table, unstack, unstack_covariance
 from epipole.schemas.columns import ATTRIBUTABLE_AXES
 from epipole.schemas.settings import TrackletSettings
@@ -48,10 +49,6 @@ from epipole.tasks.common.sightings import (
     solved_frames,
     with_lone_detections,
 )
-
-Array = npt.NDArray[np.float64]
-Indices = npt.NDArray[np.int64]
-
 
 # Tracklets that show the error of a trail: of this rate [rad/s], at which the 2 ms of a simulated
 # tracker are a twentieth of its centroid's error, and five detections at least.

@@ -8,12 +8,12 @@ from collections.abc import Iterator
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 import polars as pl
 import pyarrow as pa
 
 from epipole.io.work.parts import JUDGED, SOLVED, is_written, read_part, write_part
 from epipole.io.work.work_layout import SolvedParts, ViewedParts
+from epipole.schemas.arrays import Indices
 from epipole.schemas.bridge import array, concat, to_polars
 from epipole.schemas.settings import PositionSettings, StateSettings
 from epipole.schemas.spans import DAY_NS, Span, spans_between
@@ -40,8 +40,6 @@ from epipole.tasks.solve.view_groups import (
     with_position_error,
     with_stated_errors,
 )
-
-Indices = npt.NDArray[np.int64]
 
 
 def gather_views(

@@ -9,6 +9,7 @@ import numpy.typing as npt
 import pyarrow as pa
 from scipy.special import chdtrc
 
+from epipole.schemas.arrays import Array, Flags, Indices
 from epipole.schemas.bridge import array, empty, table, unstack, unstack_covariance
 from epipole.schemas.columns import STATE_AXES
 from epipole.schemas.rejects import Reason, reject_rows
@@ -25,9 +26,6 @@ from epipole.tasks.algorithms.orbits.orbit_fit import (
 from epipole.tasks.algorithms.orbits.shared_errors import ArcEquations, scale_shared_errors
 from epipole.tasks.common.grouping import group_offsets
 from epipole.tasks.solve.view_groups import ViewGroups
-
-Array = npt.NDArray[np.float64]
-Indices = npt.NDArray[np.int64]
 
 MIN_PROBABILITY = 1e-6  # of a chi-square: a state with a less probable one is rejected
 # Chi-square per degree of freedom over the median of all arcs: an arc above this mixes objects.
@@ -175,7 +173,7 @@ def _arcs(name: npt.NDArray[np.object_], epoch_ns: Indices, arc_s: float) -> Ind
     return arc
 
 
-def _long_enough(arc: Indices, kept: npt.NDArray[np.bool_], minimum: int) -> npt.NDArray[np.bool_]:
+def _long_enough(arc: Indices, kept: Flags, minimum: int) -> Flags:
     count = np.bincount(arc, kept, minlength=1)
     return count[arc] >= minimum if len(arc) else np.zeros(0, bool)
 

@@ -11,15 +11,12 @@ import numpy.typing as npt
 import pyarrow as pa
 import pyarrow.compute as pc
 
+from epipole.schemas.arrays import Array, Flags, Indices
 from epipole.schemas.bridge import array, stack, stack_covariance
 from epipole.schemas.columns import TANGENT_AXES
 from epipole.tasks.algorithms.constants import SPEED_OF_LIGHT_KM_S
 from epipole.tasks.algorithms.geometry.directions import apparent_positions
 from epipole.tasks.common.grouping import factorize
-
-Array = npt.NDArray[np.float64]
-Indices = npt.NDArray[np.int64]
-Flags = npt.NDArray[np.bool_]
 
 # Columns of VIEWS that are only passed on.
 LABELS = (

@@ -9,6 +9,7 @@ import pyarrow as pa
 
 from epipole.io.work.parts import VIEWED, read_part, write_part
 from epipole.io.work.work_layout import SensorParts
+from epipole.schemas.arrays import Array, Flags, Indices
 from epipole.schemas.bridge import array, empty, nullable, stack, table, unstack, unstack_covariance
 from epipole.schemas.columns import TANGENT_AXES
 from epipole.schemas.settings import AlignmentSettings, TrackletSettings
@@ -42,9 +43,6 @@ from epipole.tasks.solve.sightings import (
     tabulate_attributables,
     tabulate_sightings,
 )
-
-Array = npt.NDArray[np.float64]
-Indices = npt.NDArray[np.int64]
 
 # Of an image, per axis. What fitted optics are wrong by changes little within a part. With 1 to 12
 # the verdicts on sensors with untold optics were the same.
@@ -199,9 +197,7 @@ def _field_parts(camera: Camera, x_px: Array, y_px: Array) -> npt.NDArray[np.int
     return FIELD_PARTS * row + column
 
 
-def _centroids(
-    tracklets: TrackletSightings, query: _EpochQueries
-) -> tuple[Indices, npt.NDArray[np.bool_]]:
+def _centroids(tracklets: TrackletSightings, query: _EpochQueries) -> tuple[Indices, Flags]:
     """Return each query's centroid in its frame, and for which queries it is missing."""
     n_frames = max(int(tracklets.frame.max()), int(query.frame.max(initial=0))) + 1
     key = tracklets.tracklet * n_frames + tracklets.frame  # increasing

@@ -1,10 +1,10 @@
 """Classify detections that are no objects: hot pixels, planets, unlisted stars."""
 
 import numpy as np
-import numpy.typing as npt
 import pyarrow as pa
 from scipy.spatial import cKDTree
 
+from epipole.schemas.arrays import Array, Flags, Integers
 from epipole.schemas.bridge import array
 from epipole.tasks.algorithms.constants import ARCSEC
 from epipole.tasks.algorithms.geometry.camera import Camera, unproject
@@ -12,9 +12,6 @@ from epipole.tasks.algorithms.geometry.directions import matrix_from_quaternion
 from epipole.tasks.algorithms.orbits.planets import planet_directions
 from epipole.tasks.algorithms.tracking.hot_pixels import FixedPositions, fixed_positions
 from epipole.tasks.common.sightings import Frames, Sightings
-
-Array = npt.NDArray[np.float64]
-Flags = npt.NDArray[np.bool_]
 
 GATE_SIGMA = 4.0  # largest distance of a detection from a known hot pixel, planet or star
 
@@ -62,7 +59,7 @@ def is_planet(frames: Frames, sightings: Sightings, camera: Camera) -> Flags:
     return planets
 
 
-def at_star(sightings: Sightings, rows: npt.NDArray[np.int64], stars: Array) -> Flags:
+def at_star(sightings: Sightings, rows: Integers, stars: Array) -> Flags:
     """Return which of some sightings stand at a star.
 
     Parameters

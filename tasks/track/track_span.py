@@ -20,6 +20,7 @@ import numpy.typing as npt
 import pyarrow as pa
 
 from epipole.io.work.parts import TRACKED, Parts, write_part
+from epipole.schemas.arrays import Array, Flags, Integers
 from epipole.schemas.bridge import array, concat, empty, nullable, table
 from epipole.schemas.options import TRACK_LINKING, load_method
 from epipole.schemas.settings import TrackletSettings
@@ -62,7 +63,6 @@ from epipole.tasks.track.classify_detections import (
 
 # Measurement of runs: rates, residuals, and which of them stand still like stars.
 
-Array = npt.NDArray[np.float64]
 
 STAR_RATE_SIGMA = 4.0  # a run whose rate is smaller than this many sigmas stands still
 # rad/s: a slower run stands still, however well its rate is known. Errors of the optics of a tenth
@@ -81,7 +81,7 @@ class TrackRun(NamedTuple):
     is known well enough to exclude an object in orbit.
     """
 
-    members: npt.NDArray[np.int64]
+    members: Integers
     rate_rad_s: float
     rests: bool
     stands_still: bool
@@ -91,7 +91,7 @@ class TrackRun(NamedTuple):
 def measure_runs(
     frames: Frames,
     sightings: Sightings,
-    track: npt.NDArray[np.int64],
+    track: Integers,
     camera: Camera,
     window_s: float,
 ) -> list[TrackRun]:
@@ -223,9 +223,7 @@ def _parts(
         yield _TrackedFrames(unsolved, sightings, camera, interval_s, False)
 
 
-def _follow(
-    part: _TrackedFrames, sightings: Sightings, settings: TrackletSettings
-) -> npt.NDArray[np.int64]:
+def _follow(part: _TrackedFrames, sightings: Sightings, settings: TrackletSettings) -> Integers:
     """Return the track number of each sighting; NONE where it belongs to no track."""
     frames, camera, interval_s = part.frames, part.camera, part.interval_s
     return follow_detections(
@@ -280,7 +278,7 @@ def _label(
     return _label_objects(part, sightings, objects, labels, detections, settings, suspected)
 
 
-def _in_runs(position: npt.NDArray[np.int64], runs: list[TrackRun]) -> npt.NDArray[np.bool_]:
+def _in_runs(position: Integers, runs: list[TrackRun]) -> Flags:
     """Return which sightings are at a pixel position that a run has a sighting at."""
     members = np.concatenate([np.zeros(0, np.int64), *(run.members for run in runs)])
     return np.isin(position, np.setdiff1d(position[members], [NOWHERE]))
@@ -293,7 +291,7 @@ def _label_objects(
     labels: _Labels,
     detections: pa.Table,
     settings: TrackletSettings,
-    suspected: npt.NDArray[np.bool_],
+    suspected: Flags,
 ) -> tuple[pa.Table, pa.Table]:
     """Label the sightings of objects; return their TRACKLET_RUNS and HOT_SUSPECTS."""
     sensor_id = str(detections["sensor_id"][0])
@@ -315,7 +313,7 @@ def _label_stars(
     sightings: Sightings,
     stars: list[TrackRun],
     u_stars: Array,
-    single: npt.NDArray[np.int64],
+    single: Integers,
 ) -> None:
     """Label the runs of unlisted stars, and single sightings at these or at identified stars."""
     for run in stars:

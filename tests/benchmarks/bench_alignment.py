@@ -8,16 +8,14 @@ import tempfile
 from pathlib import Path
 
 import numpy as np
-import numpy.typing as npt
 from night_stages import position_errors, see, solve, track
 
 from epipole.flows.simulate import simulate
 from epipole.io.simulation.scenes import read_scene
+from epipole.schemas.arrays import Array
 from epipole.schemas.scene import Scene
 from epipole.schemas.settings import Settings
 from epipole.tasks.solve.positions import position_table
-
-Array = npt.NDArray[np.float64]
 
 APART = {"phase": None}
 ROUGH = APART | {"time_jitter_s": 0.01, "frame_drop": 0.05}

@@ -12,11 +12,11 @@ import argparse
 import time
 
 import numpy as np
-import numpy.typing as npt
 from bench_star_identification import judge
 from star_frames import KINDS, Kind, expose, hipparcos_at_epoch, seen_stars
 
 from epipole.io.catalogues.hipparcos import read_hipparcos
+from epipole.schemas.arrays import Array
 from epipole.schemas.settings import IdentificationSettings
 from epipole.tasks.algorithms.geometry.camera import pixel_angle, unproject
 from epipole.tasks.algorithms.geometry.directions import canonical, matrix_from_quaternion
@@ -26,7 +26,6 @@ from epipole.tasks.algorithms.star_identification.sensor import identify_sensor
 from epipole.tasks.algorithms.star_identification.sequence import no_priors
 from epipole.tasks.identify.cache_skies import CachedSkies, Catalogue
 
-Array = npt.NDArray[np.float64]
 Rng = np.random.Generator
 
 DAY = 19_723

@@ -21,10 +21,10 @@ from collections import defaultdict
 from typing import Any, NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 from scipy.stats import chi2
 
 from epipole.io.catalogues.hipparcos import read_hipparcos
+from epipole.schemas.arrays import Array
 from epipole.schemas.settings import Settings
 from epipole.tasks.algorithms.geometry.camera import Camera, inside, pixel_angle, project, unproject
 from epipole.tasks.algorithms.geometry.directions import (
@@ -37,7 +37,6 @@ from epipole.tasks.algorithms.star_identification.sensor import identify_sensor
 from epipole.tasks.algorithms.star_identification.sequence import Priors
 from epipole.tasks.identify.cache_skies import CachedSkies, Catalogue
 
-Array = npt.NDArray[np.float64]
 Rng = np.random.Generator
 
 # Field [degrees]: faintest star [V].

@@ -21,11 +21,11 @@ from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 import pyarrow as pa
 from star_frames import hipparcos_at_epoch
 
 from epipole.io.catalogues.hipparcos import read_hipparcos
+from epipole.schemas.arrays import Array
 from epipole.schemas.bridge import array, stack
 from epipole.schemas.settings import IdentificationSettings, Settings
 from epipole.schemas.work_tables import CAMERAS, EXPOSURES, SENSOR_STATES_AT_FRAMES
@@ -34,7 +34,6 @@ from epipole.tasks.algorithms.geometry.directions import canonical, matrix_from_
 from epipole.tasks.algorithms.star_catalogue import NavigationCatalogue
 from epipole.tasks.identify.identify_stars import identify_stars
 
-Array = npt.NDArray[np.float64]
 Rng = np.random.Generator
 
 # Field [degrees]: faintest star [V].

@@ -13,14 +13,12 @@ import tempfile
 from pathlib import Path
 
 import numpy as np
-import numpy.typing as npt
 
+from epipole.schemas.arrays import Array
 from epipole.tasks.algorithms.constants import ARCSEC
 from epipole.tasks.algorithms.geometry.directions import tangent_basis
 from epipole.tasks.algorithms.orbits.orbit_fit import propagate
 from epipole.tasks.algorithms.simulation.paths import state_at
-
-Array = npt.NDArray[np.float64]
 
 GEO_KM = np.array([-39359.89, 15125.76, 64.30])
 EARTH_RATE_RAD_S = np.array([0.0, 0.0, 7.2921159e-5])

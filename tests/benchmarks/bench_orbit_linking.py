@@ -16,18 +16,15 @@ from collections import Counter
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 from sgp4.api import WGS72, Satrec, SatrecArray
 
+from epipole.schemas.arrays import Array, Indices
 from epipole.schemas.settings import LinkingSettings
 from epipole.tasks.algorithms.constants import ARCSEC, SPEED_OF_LIGHT_KM_S
 from epipole.tasks.algorithms.geometry.directions import east_north
 from epipole.tasks.algorithms.orbit_linking.arc_fit import Tracklets
 from epipole.tasks.algorithms.orbit_linking.grouping import link_tracklets
 from epipole.tasks.algorithms.simulation.shells import GM_WGS72_KM3_S2, walker_elements
-
-Array = npt.NDArray[np.float64]
-Indices = npt.NDArray[np.int64]
 
 PATTERN, HEIGHT_KM, INCLINATION_DEG = (1584, 72, 39), 550.0, 53.0
 SCATTER_KM, ECCENTRICITY = 10.0, 1e-3

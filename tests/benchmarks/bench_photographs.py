@@ -17,9 +17,9 @@ import time
 from pathlib import Path
 
 import numpy as np
-import numpy.typing as npt
 
 from epipole.io.catalogues.hipparcos import read_hipparcos
+from epipole.schemas.arrays import Array, Integers
 from epipole.schemas.settings import Settings
 from epipole.tasks.algorithms.geometry.camera import Camera, pixel_angle, unproject
 from epipole.tasks.algorithms.geometry.directions import boresight_angles
@@ -29,12 +29,11 @@ from epipole.tasks.algorithms.star_identification.sensor import IdentifiedSensor
 from epipole.tasks.algorithms.star_identification.sequence import no_priors
 from epipole.tasks.identify.cache_skies import CachedSkies, Catalogue
 
-Array = npt.NDArray[np.float64]
 DEFAULT = Settings().identification
 HOW = MatchSettings(DEFAULT.gate_sigma, -np.log(DEFAULT.false_alarm), DEFAULT.time_limit_s, np.nan)
 
 
-def read_list(path: Path) -> tuple[Array, Array, npt.NDArray[np.int64]]:
+def read_list(path: Path) -> tuple[Array, Array, Integers]:
     """Return x, y [px] and the star numbers, 0 where none is given."""
     with path.open() as file:
         rows = list(csv.DictReader(file))

@@ -19,7 +19,6 @@ from tempfile import gettempdir
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 from star_frames import (
     CELLS,
     MERGED_PX,
@@ -31,6 +30,7 @@ from star_frames import (
 )
 from star_peers import Solver, cedar_solve, tetra3rs
 
+from epipole.schemas.arrays import Array, Flags
 from epipole.schemas.settings import Settings
 from epipole.tasks.algorithms.geometry.camera import pixel_angle, unproject
 from epipole.tasks.algorithms.geometry.directions import (
@@ -59,8 +59,6 @@ from epipole.tasks.algorithms.star_identification.star_grid import (
     sky_grid,
     sky_to_limit,
 )
-
-Array = npt.NDArray[np.float64]
 
 SHARED = Path(__file__).parents[3] / "shared" / "data" / "starid"
 RIGHT_DEG, RIGHT_ROLL_DEG, WRONG_DEG = 0.05, 0.5, 0.25
@@ -132,8 +130,8 @@ class Ours:
 class Row(NamedTuple):
     """A solver's results: right and wrong for each frame, CPU milliseconds."""
 
-    right: npt.NDArray[np.bool_]
-    wrong: npt.NDArray[np.bool_]
+    right: Flags
+    wrong: Flags
     ms: Array
 
     def text(self, name: str) -> str:

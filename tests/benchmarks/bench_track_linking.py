@@ -16,6 +16,7 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
+from epipole.schemas.arrays import Array
 from epipole.tasks.algorithms.tracking.linking.chains import Fragments, LinkRule, chain_heads
 from epipole.tasks.algorithms.tracking.linking.likelihood_ratio import link_by_likelihood
 from epipole.tasks.algorithms.tracking.linking.prediction import link_by_prediction
@@ -61,7 +62,7 @@ def prediction(scene: BrokenTracks) -> Labels:
     return np.repeat(chain_heads(links.before), np.diff(scene.offsets))
 
 
-def pixels(scene: BrokenTracks) -> npt.NDArray[np.float64]:
+def pixels(scene: BrokenTracks) -> Array:
     """Return the detections' places in one image: the plane about their mean direction."""
     middle = scene.u_icrs.mean(axis=0)
     middle /= np.linalg.norm(middle)

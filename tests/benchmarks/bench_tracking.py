@@ -13,6 +13,7 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from epipole.schemas.arrays import Array
 from epipole.tasks.algorithms.tracking.runs import follow_detections
 
 sys.path.append(str(Path(__file__).parents[1]))  # what tests share
@@ -20,7 +21,6 @@ from scenes.few_frames import FIELD_RAD as SMALL_FIELD_RAD
 from scenes.few_frames import INTERVAL_S, few_frames, found_and_false
 from scenes.identity_score import identity_f1
 
-Array = npt.NDArray[np.float64]
 Labels = npt.NDArray[np.int64]
 
 FIELD_RAD = np.radians(8.0)

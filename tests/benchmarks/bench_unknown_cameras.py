@@ -12,10 +12,10 @@ import time
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 from star_frames import Kind, expose, hipparcos_at_epoch, seen_stars
 
 from epipole.io.catalogues.hipparcos import read_hipparcos
+from epipole.schemas.arrays import Array
 from epipole.tasks.algorithms.geometry.camera import Camera, mirrored
 from epipole.tasks.algorithms.geometry.directions import canonical, matrix_from_quaternion
 from epipole.tasks.algorithms.star_identification.camera_search import ImageFrame, find_cameras
@@ -77,7 +77,7 @@ def _frame(
     x, y, magnitude, _ = expose(kind, seen, R, 0.3, 3, 0.1, rng)  # type: ignore[arg-type]
     if is_mirrored:
         y = kind.width_px - 1 - y
-    unknown: npt.NDArray[np.float64] = np.full(len(x), np.nan)
+    unknown: Array = np.full(len(x), np.nan)
     return ImageFrame(x, y, unknown, magnitude if flux else unknown, np.zeros(3))
 
 

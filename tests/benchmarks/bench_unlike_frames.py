@@ -17,12 +17,12 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 from bench_crowded_frames import APART_S, DAY
 from bench_star_identification import judge
 from star_frames import KINDS, Kind, expose, hipparcos_at_epoch, seen_stars
 
 from epipole.io.catalogues.hipparcos import read_hipparcos
+from epipole.schemas.arrays import Array, Flags
 from epipole.schemas.settings import Settings
 from epipole.tasks.algorithms.geometry.camera import pixel_angle, unproject
 from epipole.tasks.algorithms.geometry.directions import (
@@ -36,7 +36,6 @@ from epipole.tasks.algorithms.star_identification.sensor import identify_sensor
 from epipole.tasks.algorithms.star_identification.sequence import Priors, no_priors
 from epipole.tasks.identify.cache_skies import CachedSkies, Catalogue
 
-Array = npt.NDArray[np.float64]
 Rng = np.random.Generator
 
 SIGMA_PX, FALSE, MISSING = 0.15, 3, 0.05
@@ -56,7 +55,7 @@ class Scene(NamedTuple):
     shots: list[Array]
     R: Array
     sigma_px: Array
-    sky: npt.NDArray[np.bool_]
+    sky: Flags
     priors: Priors
 
 

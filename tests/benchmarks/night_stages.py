@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 import pyarrow as pa
 import pyarrow.compute as pc
 
@@ -15,6 +14,7 @@ from epipole.flows.command_line.log_info import of_sensor, sensor_ids
 from epipole.io.catalogues.star_catalogue import read_star_catalogue
 from epipole.io.work.parts import VIEWED, write_part
 from epipole.io.work.work_layout import SolvedParts, ViewedParts
+from epipole.schemas.arrays import Array
 from epipole.schemas.bridge import array, concat, stack
 from epipole.schemas.settings import Settings
 from epipole.schemas.spans import Sensor, Span, spans_between
@@ -32,11 +32,10 @@ from epipole.tasks.solve.view_groups import ViewGroups, unpack_views
 from epipole.tasks.solve.views import sensor_epochs, view_objects, viewed_tracklets
 from epipole.tasks.track.track_span import Tracked
 
-Array = npt.NDArray[np.float64]
 sys.path.append(str(Path(__file__).parents[1]))  # helpers beside the tests
 
-from scenes.identified import identified, tracked  # noqa: E402
-from scenes.whole_logs import read_whole  # noqa: E402
+from scenes.identified import identified, tracked
+from scenes.whole_logs import read_whole
 
 
 class IdentifiedLog(NamedTuple):

@@ -7,8 +7,8 @@ attitude errors of 1" (x, y) and 8" (roll), 95 % of the objects detected.
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
+from epipole.schemas.arrays import Array, Integers
 from epipole.tasks.algorithms.association.samples import Samples
 from epipole.tasks.algorithms.constants import ARCSEC
 from epipole.tasks.algorithms.geometry.covariances import (
@@ -35,13 +35,13 @@ class Points(NamedTuple):
     """Samples of one instant, the object of each point (-1: false), and the positions [km]."""
 
     samples: Samples
-    who: npt.NDArray[np.int64]
-    x_km: npt.NDArray[np.float64]
+    who: Integers
+    x_km: Array
 
 
-def low_orbits(rng: np.random.Generator, n: int) -> npt.NDArray[np.float64]:
+def low_orbits(rng: np.random.Generator, n: int) -> Array:
     """Return positions of sensors at 600 to 1200 km that see the centre past the Earth."""
-    out: list[npt.NDArray[np.float64]] = []
+    out: list[Array] = []
     while len(out) < n:
         r = rng.normal(size=3)
         r *= rng.uniform(6980, 7580) / np.linalg.norm(r)
@@ -106,7 +106,7 @@ def scene(
     return Points(samples, np.concatenate(who), x)
 
 
-def oracle_groups(points: Points, least: float, lead: float) -> npt.NDArray[np.int64]:
+def oracle_groups(points: Points, least: float, lead: float) -> Integers:
     """Return the groups from the true positions of the objects: the best that errors allow.
 
     In each sensor an object gets the point that fits best, if its log-odds against "missed, and
@@ -148,7 +148,7 @@ class Score(NamedTuple):
         return 2 * self.right / max(self.wanted + self.groups, 1)
 
 
-def judge(points: Points, group: npt.NDArray[np.int64], least: int = 3) -> Score:
+def judge(points: Points, group: Integers, least: int = 3) -> Score:
     """Score groups of `least` views or more.
 
     A group is right if it holds at least that many of its object's points and no other;

@@ -4,9 +4,9 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
 from epipole.io.catalogues.hipparcos import HIPPARCOS_EPOCH, read_hipparcos
+from epipole.schemas.arrays import Array, Integers
 from epipole.schemas.bridge import array
 from epipole.tasks.algorithms.geometry.camera import Camera, inside, project
 from epipole.tasks.algorithms.geometry.directions import canonical, matrix_from_quaternion
@@ -15,8 +15,6 @@ from epipole.tasks.algorithms.star_catalogue import (
     navigation_catalogue,
     star_directions,
 )
-
-Array = npt.NDArray[np.float64]
 
 EPOCH = 2024.0
 MERGED_PX = 2.0
@@ -60,13 +58,13 @@ class Frames(NamedTuple):
 
     kind: Kind
     stars: NavigationCatalogue
-    offset: npt.NDArray[np.int64]
+    offset: Integers
     x_px: Array
     y_px: Array
     mag: Array
-    star_id: npt.NDArray[np.int64]
+    star_id: Integers
     R_sensor_from_icrs: Array
-    cell: npt.NDArray[np.int64]
+    cell: Integers
 
 
 def read_frames(folder: Path, name: str) -> Frames:
@@ -102,7 +100,7 @@ def seen_stars(stars: NavigationCatalogue, kind: Kind) -> NavigationCatalogue:
     return NavigationCatalogue(*[column[:n] for column in merged])
 
 
-def make_frames(name: str, cells: npt.NDArray[np.int64], seed: int) -> Frames:
+def make_frames(name: str, cells: Integers, seed: int) -> Frames:
     """Return one frame of the cell for each entry of `cells`, all attitudes equally likely."""
     rng = np.random.default_rng(seed)
     kind = KINDS[name]
@@ -123,7 +121,7 @@ def expose(
     n_false: int,
     missing: float,
     rng: np.random.Generator,
-) -> tuple[Array, Array, Array, npt.NDArray[np.int64]]:
+) -> tuple[Array, Array, Array, Integers]:
     """Return x, y [px], magnitude and true number (-1 false) of the centroids of one frame."""
     near = np.flatnonzero(seen.u_icrs @ R[2] > np.cos(1.05 * kind.camera.half_diagonal_rad))
     x, y = project(kind.camera, seen.u_icrs[near] @ R.T)

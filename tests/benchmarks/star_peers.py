@@ -11,13 +11,12 @@ from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
-import numpy.typing as npt
 from star_frames import EPOCH, Frames
 
 from epipole.io.catalogues.hipparcos import read_hipparcos
+from epipole.schemas.arrays import Array
 from epipole.schemas.bridge import array
 
-Array = npt.NDArray[np.float64]
 # x, y [px], magnitude and error [px] of a frame's centroids -> sensor from ICRS, or None.
 Solver = Callable[[Array, Array, Array, float], Array | None]
 

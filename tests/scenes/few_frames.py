@@ -3,12 +3,9 @@
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
+from epipole.schemas.arrays import Array, Indices
 from epipole.tasks.algorithms.geometry.directions import tangent_basis
-
-Array = npt.NDArray[np.float64]
-Indices = npt.NDArray[np.int64]
 
 ARCSEC = np.pi / 180 / 3600
 PIXEL_RAD = 4.5 * ARCSEC

@@ -3,14 +3,11 @@
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 from scipy.integrate import solve_ivp
 
+from epipole.schemas.arrays import Array, Indices
 from epipole.tasks.algorithms.simulation.constants import GM_KM3_S2
 from epipole.tasks.algorithms.simulation.paths import state_at
-
-Array = npt.NDArray[np.float64]
-Indices = npt.NDArray[np.int64]
 
 FIELD_RAD = np.radians(8.0)
 FIELD_PX = 1024

@@ -39,6 +39,7 @@ from epipole.io.logs.mcap.record_scan import (
     index_counts,
     length_outside,
 )
+from epipole.schemas.arrays import Integers
 from epipole.schemas.rejects import Reason
 
 RUN = -1  # the opcode of a segment with many records outside chunks
@@ -59,7 +60,7 @@ class Segment(NamedTuple):
     size: int = 0  # of its records in memory, in bytes
     cut: bool = False  # whether the file ends in this chunk
     # Of message indexes: channels, and how many messages of each.
-    counted: tuple[npt.NDArray[np.uint16], npt.NDArray[np.int64]] | None = None
+    counted: tuple[npt.NDArray[np.uint16], Integers] | None = None
 
 
 @dataclass

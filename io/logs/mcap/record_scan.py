@@ -10,6 +10,7 @@ from numba import njit, types
 from numba.extending import intrinsic
 
 from epipole.io.caches.kernels import use_kernel_cache
+from epipole.schemas.arrays import Flags, Integers
 
 # Compilation, as in `epipole.tasks.algorithms.kernels`: io may not import it, a test compares both.
 
@@ -78,8 +79,8 @@ class RecordIndex(NamedTuple):
     opcode: npt.NDArray[np.uint8]
     channel: npt.NDArray[np.uint16]
     time_ns: npt.NDArray[np.uint64]
-    start: npt.NDArray[np.int64]
-    end: npt.NDArray[np.int64]
+    start: Integers
+    end: Integers
     n_strange: int  # records that do not belong here or are too short
     first_strange: int  # where the first of these begins
     walked: int  # bytes up to the end of the walk: all bytes, unless there is damage
@@ -194,7 +195,7 @@ def _walk_indexes(data, limit, number, counted):
     return n, at
 
 
-def changed_declarations(data: Bytes, index: RecordIndex, last: Hashes) -> npt.NDArray[np.bool_]:
+def changed_declarations(data: Bytes, index: RecordIndex, last: Hashes) -> Flags:
     """Return which records are no repetition of the last declaration under their number.
 
     Some recorders declare a channel before each of its messages. `last` are the hashes of these

@@ -43,6 +43,7 @@ from epipole.io.logs.mcap.record_scan import (
     no_declarations,
 )
 from epipole.io.logs.mcap.undeclared import Channels, LateMessages, Undeclared
+from epipole.schemas.arrays import Integers
 from epipole.schemas.rejects import Reason
 
 # The uncompressed size of all chunks together may not exceed max(16 MiB, 200 x the file's size):
@@ -59,7 +60,6 @@ SMALL_BYTES = 4 << 10  # a chunk of fewer is opened sooner than given to another
 MAX_PER_BYTE = 1000
 
 PER_RECORD = ("opcode", "channel", "time_ns", "start", "end")  # columns of an index
-Numbers = npt.NDArray[np.int64]
 
 
 class Block(NamedTuple):
@@ -69,9 +69,9 @@ class Block(NamedTuple):
     channels: dict[int, Channel]  # by number
     channel: npt.NDArray[np.uint16]  # number
     time_ns: npt.NDArray[np.uint64]  # when it was logged
-    start: Numbers
-    end: Numbers
-    offset: Numbers  # in the file, of its chunk; outside chunks, of the message
+    start: Integers
+    end: Integers
+    offset: Integers  # in the file, of its chunk; outside chunks, of the message
 
 
 @dataclass
@@ -213,7 +213,7 @@ class RecordWalk:
                 self._damage.add(segment.at, 0, Reason.BAD_DATA_CHECKSUM)
 
     def _walk_index(
-        self, data: Bytes, index: RecordIndex, offset: Numbers, start_ns: int
+        self, data: Bytes, index: RecordIndex, offset: Integers, start_ns: int
     ) -> Iterator[Block]:
         """Yield the runs of messages between declarations of schemas and channels."""
         keep = changed_declarations(data, index, self._declared)
@@ -235,7 +235,7 @@ class RecordWalk:
                 self._damage.add(int(offset[i]), start_ns, Reason.DAMAGED_RECORD)
 
     def _wanted(
-        self, data: Bytes, index: RecordIndex, offset: Numbers, run: slice
+        self, data: Bytes, index: RecordIndex, offset: Integers, run: slice
     ) -> Iterator[Block]:
         """Yield the wanted messages of a run; all messages are counted."""
         channel = index.channel[run]
@@ -272,7 +272,7 @@ class RecordWalk:
     # What is declared too late, or never
 
     def _add_undeclared(
-        self, numbers: list[int], channel: npt.NDArray[np.uint16], time_ns: Any, offset: Numbers
+        self, numbers: list[int], channel: npt.NDArray[np.uint16], time_ns: Any, offset: Integers
     ) -> None:
         first = np.zeros(int(channel.max()) + 1, np.int64)
         first[channel[::-1]] = np.arange(len(channel))[::-1]  # the last assignment counts
@@ -306,7 +306,7 @@ class RecordWalk:
 
     # What is missing in it
 
-    def _count_lost(self, at: int, numbers: Channels, counted: Numbers) -> None:
+    def _count_lost(self, at: int, numbers: Channels, counted: Integers) -> None:
         """Count the messages that indexes have and the chunk before them had not.
 
         The chunk was left out, or it was no chunk any more, or a part of it was damaged.
@@ -355,7 +355,7 @@ def _open(segment: Segment, opening: Future[OpenedChunk] | None) -> OpenedChunk:
     return OpenedChunk(0, segment.data)
 
 
-def _offsets(segment: Segment, index: RecordIndex) -> Numbers:
+def _offsets(segment: Segment, index: RecordIndex) -> Integers:
     """Return where in the file the records lie; those of a chunk lie where the chunk does."""
     if segment.opcode == CHUNK:
         return np.full(len(index.start), segment.at)

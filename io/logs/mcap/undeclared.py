@@ -12,6 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from epipole.io.logs.mcap.container import Channel, ChannelTable
+from epipole.schemas.arrays import Integers
 from epipole.schemas.rejects import Reason
 
 N_CHANNELS = 1 << 16  # with distinct numbers of 16 bits
@@ -90,7 +91,7 @@ class LateMessages:
         for item in self._of_log.get(log, []):
             self._n[item.number] = item.n
 
-    def take(self, channel: Channels) -> npt.NDArray[np.int64]:
+    def take(self, channel: Channels) -> Integers:
         """Return which of these messages, the next ones in the file, were not read before."""
         order = np.argsort(channel, kind="stable")
         in_order = channel[order]

@@ -7,7 +7,6 @@ from functools import cached_property, lru_cache
 from typing import Any, NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
 from epipole.io.logs.left_out import RejectList
 from epipole.io.logs.mcap.records import Block
@@ -19,6 +18,7 @@ from epipole.io.logs.messages.encoding import (
 )
 from epipole.io.logs.messages.registry import message_encodings
 from epipole.io.logs.messages.scan import Messages
+from epipole.schemas.arrays import Indices
 from epipole.schemas.log_bounds import TIME
 from epipole.schemas.log_messages import CALIBRATION, FRAME, SENSOR_ID_PATTERN, STATE
 from epipole.schemas.rejects import Reason
@@ -31,7 +31,6 @@ UNDECODABLE = {
     STATE: Reason.UNDECODABLE_STATE,
     CALIBRATION: Reason.UNDECODABLE_CALIBRATION,
 }
-Indices = npt.NDArray[np.int64]
 
 
 @lru_cache(maxsize=4096)

@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from epipole.schemas.arrays import Integers
 from epipole.schemas.log_messages import DECLARED, FRAME, STATE, MessageType
 
 # Decoded messages: the same plain values in every encoding.
@@ -133,7 +134,6 @@ class MessageEncoding:
 # 0. Columns 2 f and 2 f + 1 are of field number f: the time [ns], the integer or the bits of the
 # double; or the offset and the length of the text or array; 0 and 0 where the field was not sent.
 
-Integers = npt.NDArray[np.int64]
 
 # The type of a field; UNKNOWN is a field number that the message does not declare.
 UNKNOWN, TIME, TEXT, INTEGER, DOUBLE, FLOATS, DOUBLES = range(7)

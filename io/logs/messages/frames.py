@@ -11,6 +11,7 @@ from epipole.io.logs.left_out import RejectList
 from epipole.io.logs.messages.batches import MessageBatch, Received, fault, known_id
 from epipole.io.logs.messages.encoding import FrameMessage
 from epipole.io.logs.messages.scan import FrameRows, NameCodes, scan_frames
+from epipole.schemas.arrays import Flags, Integers
 from epipole.schemas.bridge import table
 from epipole.schemas.log_bounds import (
     CENTROID_POSITION,
@@ -24,8 +25,6 @@ from epipole.schemas.rejects import Reason
 from epipole.schemas.work_tables import EXPOSURES
 
 Floats = npt.NDArray[np.float32]
-Bools = npt.NDArray[np.bool_]
-Integers = npt.NDArray[np.int64]
 
 BATCH = 65536  # frames in one table of those that are joined
 BATCH_CENTROIDS = 1 << 21
@@ -212,7 +211,7 @@ def _frame_fault(frame: FrameMessage) -> Reason | None:
     return None
 
 
-def _within(bound: Bound, values: Floats) -> Bools:
+def _within(bound: Bound, values: Floats) -> Flags:
     """Return which values lie within a bound, as float32 like the values; false for NaN."""
     minimum, maximum = np.float32(bound.minimum), np.float32(bound.maximum)
     return np.asarray((values >= minimum) & (values <= maximum))
@@ -226,7 +225,7 @@ def _joined(arrays: Sequence[npt.NDArray[np.floating]]) -> Floats:
 
 def _joined_or_nan(
     arrays: Sequence[npt.NDArray[np.floating]], lengths: Integers
-) -> tuple[Floats, Bools]:
+) -> tuple[Floats, Flags]:
     """Return the arrays joined, with NaN for empty arrays, and which arrays are not empty."""
     given = np.array([len(a) for a in arrays], np.int64) == lengths
     out = np.full(lengths.sum(), np.nan, np.float32)
@@ -234,14 +233,14 @@ def _joined_or_nan(
     return out, given & (lengths > 0)
 
 
-def _any(bad: Bools, lengths: Integers) -> Bools:
+def _any(bad: Flags, lengths: Integers) -> Flags:
     """Return for each frame whether any of its centroids is bad."""
     before = np.concatenate([[0], np.cumsum(bad)])
     end = np.cumsum(lengths)
     return before[end] > before[end - lengths]
 
 
-def _lists(name: str, flat: Floats, offsets: pa.Array, given: Bools | None = None) -> pa.ListArray:
+def _lists(name: str, flat: Floats, offsets: pa.Array, given: Flags | None = None) -> pa.ListArray:
     """Return a list per row; null where not `given`, whose values are skipped."""
     kind = EXPOSURES.field(name).type
     null = None if given is None or given.all() else pa.array(~given)

@@ -19,6 +19,7 @@ import pyarrow as pa
 
 from epipole.io.logs.mcap.record_scan import Bytes, kernel, load_int32, load_uint64
 from epipole.schemas import log_bounds as bounds
+from epipole.schemas.arrays import Array, Flags, Integers
 
 MAX_NAMES = 1024  # sensors that a scan can distinguish; decoding has no limit
 NAME_BYTES = 63
@@ -57,16 +58,16 @@ class Messages(NamedTuple):
 
     data: Bytes
     channel: npt.NDArray[np.uint16]
-    fields: npt.NDArray[np.int64]  # as in `messages.encoding`
+    fields: Integers  # as in `messages.encoding`
 
 
 class Names(NamedTuple):
     """Names so far; the code of a name is its row."""
 
     text: npt.NDArray[np.uint8]  # (MAX_NAMES, NAME_BYTES)
-    length: npt.NDArray[np.int64]
-    n: npt.NDArray[np.int64]  # (1,)
-    hint: npt.NDArray[np.int64]  # (65536,) the last code on a channel
+    length: Integers
+    n: Integers  # (1,)
+    hint: Integers  # (65536,) the last code on a channel
 
 
 def new_names() -> Names:
@@ -79,12 +80,12 @@ class FrameRows(NamedTuple):
     """Columns of frames and of their centroids, with room at their ends."""
 
     sensor: npt.NDArray[np.int32]
-    number: npt.NDArray[np.int64]
-    time_ns: npt.NDArray[np.int64]
-    exposure_s: npt.NDArray[np.float64]
+    number: Integers
+    time_ns: Integers
+    exposure_s: Array
     first: npt.NDArray[np.int32]  # (frames + 1,): where the centroids of a frame begin
-    has_flux: npt.NDArray[np.bool_]
-    has_sigma: npt.NDArray[np.bool_]
+    has_flux: Flags
+    has_sigma: Flags
     x_px: npt.NDArray[np.float32]
     y_px: npt.NDArray[np.float32]
     flux: npt.NDArray[np.float32]  # NaN where unknown
@@ -96,11 +97,11 @@ class StateRows(NamedTuple):
 
     sensor: npt.NDArray[np.int32]
     frame: npt.NDArray[np.int32]
-    time_ns: npt.NDArray[np.int64]
-    r_km: npt.NDArray[np.float64]  # (n, 3)
-    v_km_s: npt.NDArray[np.float64]  # (n, 3), NaN where not sent
-    q: npt.NDArray[np.float64]  # (n, 4) as sent, NaN where not
-    sigma: npt.NDArray[np.float64]  # (n, 2) of position [km] and attitude [arcsec], as sent
+    time_ns: Integers
+    r_km: Array  # (n, 3)
+    v_km_s: Array  # (n, 3), NaN where not sent
+    q: Array  # (n, 4) as sent, NaN where not
+    sigma: Array  # (n, 2) of position [km] and attitude [arcsec], as sent
 
 
 @kernel

@@ -18,8 +18,8 @@ from itertools import chain
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
+from epipole.schemas.arrays import Array, Flags, Indices
 from epipole.tasks.algorithms.association.hypothesis_queue import Hypothesis
 from epipole.tasks.algorithms.association.odds import in_view
 from epipole.tasks.algorithms.association.samples import Samples
@@ -27,9 +27,6 @@ from epipole.tasks.algorithms.association.views import Views
 from epipole.tasks.algorithms.constants import ARCSEC
 from epipole.tasks.algorithms.kernels import kernel
 
-Array = npt.NDArray[np.float64]
-Indices = npt.NDArray[np.int64]
-Flags = npt.NDArray[np.bool_]
 CERTAIN_LOG_ODDS = 8.0  # log-odds from which a group is certain
 # Minimum number of other sensors that detect an object: with several instants, with a single one.
 MIN_OTHERS, MIN_OTHERS_AT_ONCE = 3, 4

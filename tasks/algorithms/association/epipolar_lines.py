@@ -9,13 +9,11 @@ column for each image collects the objects on which all pairs agree. Errors are 
 from collections.abc import Mapping, Sequence
 
 import numpy as np
-import numpy.typing as npt
 
+from epipole.schemas.arrays import Array, Indices
 from epipole.tasks.algorithms.association.samples import FREE, Groups, Samples
 from epipole.tasks.algorithms.geometry.directions import skew
 
-Array = npt.NDArray[np.float64]
-Indices = npt.NDArray[np.int64]
 Pairs = Mapping[tuple[int, int], Indices]
 
 OUTLIER_SIGMA = 3.0  # farthest point from the mean, per axis, in standard deviations

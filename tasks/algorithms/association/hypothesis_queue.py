@@ -5,8 +5,7 @@ from collections import defaultdict
 from collections.abc import Iterable
 from dataclasses import dataclass
 
-import numpy as np
-import numpy.typing as npt
+from epipole.schemas.arrays import Array, Flags, Integers
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -21,8 +20,8 @@ class Hypothesis:
     score: float
     seed: tuple[int, int]
     members: tuple[int, ...]
-    x_km: npt.NDArray[np.float64]
-    missed: npt.NDArray[np.int64]
+    x_km: Array
+    missed: Integers
 
 
 class HypothesisQueue:
@@ -51,9 +50,7 @@ class HypothesisQueue:
         found = dict.fromkeys(other for i in h.members for other in self._by_tracklet[i])
         return [other for other in found if other is not h]
 
-    def rivals(
-        self, best: Hypothesis, closer_than: float, grouped: npt.NDArray[np.bool_]
-    ) -> list[Hypothesis]:
+    def rivals(self, best: Hypothesis, closer_than: float, grouped: Flags) -> list[Hypothesis]:
         """Return hypotheses about as likely as `best` that contradict it.
 
         They share a tracklet with it, neither contains the other, and none of their tracklets

@@ -22,8 +22,8 @@ from collections.abc import Iterable
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
+from epipole.schemas.arrays import Array, Indices
 from epipole.tasks.algorithms.association.chance import (
     CERTAIN_LOG_ODDS,
     chance_of,
@@ -53,9 +53,6 @@ from epipole.tasks.algorithms.association.search.sensor_pairs import (
 )
 from epipole.tasks.algorithms.association.views import views_of
 from epipole.tasks.algorithms.constants import EARTH_RADIUS_KM
-
-Array = npt.NDArray[np.float64]
-Indices = npt.NDArray[np.int64]
 
 PRIOR_DETECTION = 0.9  # probability of detection before the data are known
 FEW_SENSORS = 6  # up to this number, every pair of sensors provides seeds

@@ -6,11 +6,8 @@ A sample is the direction of a tracklet, or of a single detection, at one instan
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
-Array = npt.NDArray[np.float64]
-Indices = npt.NDArray[np.int64]
-Flags = npt.NDArray[np.bool_]
+from epipole.schemas.arrays import Array, Flags, Indices
 
 FREE = -1  # the object of a tracklet that belongs to none
 

@@ -8,16 +8,11 @@ multiplications, and a grid of cells holds the tracklets that are near.
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
+from epipole.schemas.arrays import Array, Flags, Indices
 from epipole.tasks.algorithms.association.samples import Samples
 from epipole.tasks.algorithms.constants import SPEED_OF_LIGHT_KM_S
 from epipole.tasks.algorithms.kernels import borrowing_kernel, kernel
-
-Array = npt.NDArray[np.float64]
-Indices = npt.NDArray[np.int64]
-Flags = npt.NDArray[np.bool_]
-
 
 # Columns of `Views.sight` and `Views.camera`. For a tracklet or a sensor at an instant the search
 # reads a single row. Few arrays also compile fast.

@@ -8,14 +8,10 @@ groups keep their short windows, because tracklets come and go.
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
+from epipole.schemas.arrays import Flags, Indices
 from epipole.tasks.algorithms.association.chance import CERTAIN_LOG_ODDS
 from epipole.tasks.algorithms.association.samples import FREE, Groups
-
-Array = npt.NDArray[np.float64]
-Indices = npt.NDArray[np.int64]
-Flags = npt.NDArray[np.bool_]
 
 MIN_LENGTH_RATIO = 2.0  # minimum duration of a tracklet that is decided again, over the last window
 

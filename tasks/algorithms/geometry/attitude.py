@@ -5,12 +5,10 @@ The error of an attitude R is a small rotation phi about the sensor axes,
 """
 
 import numpy as np
-import numpy.typing as npt
 
+from epipole.schemas.arrays import Array
 from epipole.tasks.algorithms.kernels import borrowing_kernel, kernel
 from epipole.tasks.algorithms.symmetric_matrices import invert_symmetric
-
-Array = npt.NDArray[np.float64]
 
 
 def optimal_attitude(u_sensor: Array, u_icrs: Array, sigma_rad: Array) -> tuple[Array, Array]:

@@ -18,9 +18,8 @@ modelling for graduates (2019): the equations of this module.
 from itertools import combinations
 
 import numpy as np
-import numpy.typing as npt
 
-Array = npt.NDArray[np.float64]
+from epipole.schemas.arrays import Array, Integers
 
 MAX_STEPS = 50  # of Newton's or Gauss-Newton's method; convergence takes about five
 CONVERGED = 1e-12  # relative change of the focal length
@@ -231,7 +230,7 @@ def attitude_error(u: Array, sigma_rad: float) -> float:
     return float(sigma_rad * np.sqrt(0.5 * np.trace(np.linalg.inv(information))))
 
 
-def best_three(u: Array) -> npt.NDArray[np.int64]:
+def best_three(u: Array) -> Integers:
     """Return the rows of the three directions with the least `attitude_error`, ascending.
 
     The error of three stars falls as the volume of their tetrahedron grows. All triples of the

@@ -13,9 +13,8 @@ from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
-Array = npt.NDArray[np.float64]
+from epipole.schemas.arrays import Array, Flags
 
 # Largest angle from the boresight that a fisheye shows [rad]. Directions are compared on the plane
 # at right angles to the boresight, which ends at pi / 2.
@@ -281,7 +280,7 @@ def project(camera: Camera, u: Array) -> tuple[Array, Array]:
     return camera.cx_px + camera.fx_px * x, camera.cy_px + camera.fy_px * y
 
 
-def inside(camera: Camera, x_px: Array, y_px: Array) -> npt.NDArray[np.bool_]:
+def inside(camera: Camera, x_px: Array, y_px: Array) -> Flags:
     """Return which pixel positions lie on the image; false for NaN."""
     return (
         (x_px >= -0.5) & (x_px < camera.width - 0.5) & (y_px >= -0.5) & (y_px < camera.height - 0.5)

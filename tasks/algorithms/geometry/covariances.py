@@ -7,8 +7,8 @@ right.
 """
 
 import numpy as np
-import numpy.typing as npt
 
+from epipole.schemas.arrays import Array, Flags, Indices
 from epipole.tasks.algorithms.geometry.camera import (
     Camera,
     ideal_position,
@@ -18,9 +18,6 @@ from epipole.tasks.algorithms.geometry.camera import (
 )
 from epipole.tasks.algorithms.geometry.directions import skew, tangent_basis
 from epipole.tasks.algorithms.kernels import kernel
-
-Array = npt.NDArray[np.float64]
-Indices = npt.NDArray[np.int64]
 
 MAX_LEVERAGE = 0.8  # a direction with more determines the fit: no residual is left
 MAX_PRODUCT = 20.0  # [variances] a larger product of two residuals is of another object
@@ -69,9 +66,7 @@ def on_tangent_plane(u_icrs: Array, cov: Array) -> Array:
     return basis @ cov @ np.swapaxes(basis, -1, -2)
 
 
-def scatter_beyond(
-    residual_rad: Array, sigma_rad: Array, leverage: Array, follows: npt.NDArray[np.bool_]
-) -> float:
+def scatter_beyond(residual_rad: Array, sigma_rad: Array, leverage: Array, follows: Flags) -> float:
     """Return the variance of directions, per axis, in excess of their stated one [rad^2].
 
     It divides the error of a prior attitude into a part that changes from frame to frame and a
@@ -201,7 +196,7 @@ def shared_attitude_covariance(
 
 
 def shared_direction_covariance(
-    camera: Camera, cov_optics: Array, u: Array, from_stars: npt.NDArray[np.bool_]
+    camera: Camera, cov_optics: Array, u: Array, from_stars: Flags
 ) -> Array:
     """Return (n, 3, 3) covariances of directions due to the error of the optics [rad^2].
 

@@ -5,11 +5,9 @@ of a vector in frame a to those in frame b.
 """
 
 import numpy as np
-import numpy.typing as npt
 
+from epipole.schemas.arrays import Array
 from epipole.tasks.algorithms.constants import SPEED_OF_LIGHT_KM_S
-
-Array = npt.NDArray[np.float64]
 
 
 def matrix_from_quaternion(q: Array) -> Array:

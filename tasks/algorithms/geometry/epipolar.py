@@ -7,12 +7,9 @@ of the same object from the other sensor lies in it. In an image the plane is th
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
+from epipole.schemas.arrays import Array, Indices
 from epipole.tasks.algorithms.kernels import kernel
-
-Array = npt.NDArray[np.float64]
-Indices = npt.NDArray[np.int64]
 
 
 class UncertainSight(NamedTuple):

@@ -12,14 +12,11 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
+from epipole.schemas.arrays import Array, Indices
 from epipole.tasks.algorithms.geometry.camera import Camera, project
 from epipole.tasks.algorithms.geometry.covariances import OPTICS, image_derivatives
 from epipole.tasks.algorithms.kernels import kernel
-
-Array = npt.NDArray[np.float64]
-Indices = npt.NDArray[np.int64]
 
 # 1-sigma prior about the given calibration. It matters only for what the stars do not determine: in
 # a narrow field a shift of the principal point equals a rotation of the sensor, and the higher

@@ -7,15 +7,12 @@ residual is the angle between the direction and the point, on the direction's ta
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
+from epipole.schemas.arrays import Array, Flags, Indices
 from epipole.tasks.algorithms.constants import SPEED_OF_LIGHT_KM_S
 from epipole.tasks.algorithms.geometry.directions import tangent_basis
 from epipole.tasks.algorithms.kernels import kernel
 from epipole.tasks.algorithms.symmetric_matrices import invert_symmetric
-
-Array = npt.NDArray[np.float64]
-Indices = npt.NDArray[np.int64]
 
 ITERATIONS = 12
 CONVERGED = 1e-9  # of the range
@@ -59,7 +56,7 @@ class Triangulated(NamedTuple):
     r_km: Array
     cov_km2: Array
     chi2: Array
-    used: npt.NDArray[np.bool_]
+    used: Flags
     mean_range_km: Array
 
 

@@ -1,10 +1,9 @@
 """A sensor that turns: its rate from its attitudes, and directions turned by it."""
 
 import numpy as np
-import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
-Array = npt.NDArray[np.float64]
+from epipole.schemas.arrays import Array, Flags
 
 # Attitudes farther apart than this in time, or by this angle, tell no rate [s, rad]. A sensor that
 # turns faster than 12 deg/s has jumped.
@@ -14,7 +13,7 @@ MAX_APART_S, MAX_TURNED, MAX_RATE = 10.0, 0.5, 0.2
 SAME_SHARE, SAME_RATE = 0.5, 1e-3
 
 
-def angular_rates(t_s: Array, R: Array, known: npt.NDArray[np.bool_]) -> Array:
+def angular_rates(t_s: Array, R: Array, known: Flags) -> Array:
     """Return the rates (F, 3) at which directions turn in a sensor's frames [rad/s, sensor axes].
 
     Directions of stars change by the cross product of the rate with them. The rate of a frame is

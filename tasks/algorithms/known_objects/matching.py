@@ -13,10 +13,10 @@ from collections.abc import Sequence
 from typing import NamedTuple, Protocol
 
 import numpy as np
-import numpy.typing as npt
 from scipy.optimize import minimize
 from scipy.special import gammaincinv, logsumexp
 
+from epipole.schemas.arrays import Array, Flags, Indices, Integers
 from epipole.tasks.algorithms.constants import LN_2PI
 from epipole.tasks.algorithms.known_objects.prediction import (
     ElementErrors,
@@ -28,9 +28,6 @@ from epipole.tasks.algorithms.known_objects.prediction import (
     sensitivities,
     sigmas,
 )
-
-Array = npt.NDArray[np.float64]
-Indices = npt.NDArray[np.int64]
 
 MAX_ROWS = 8  # maximum number of positions of an object that are compared
 GATE_SHARE = 0.9999  # share of true matches that pass the chi-square test
@@ -51,6 +48,7 @@ WORST = QUALITIES[-1][0]
 # in ten of all are less than 0.8 km off in height and across.
 THRUSTING = ((0.10, 12.0), (0.03, 40.0))
 THRUSTING_KM = np.array([1.0, 1.0, 1.0, 0.5, 0.5, 0.0])
+SURE = 0.999  # probability of a match that counts where errors and times are learnt
 MIN_LISTED = 1e-3  # minimum probability of a satellite that is listed for an object
 DRAG_REACH_KM_DAY2 = 0.2  # drag error of a satellite that decays soon
 DAY_NS = 86_400_000_000_000
@@ -71,7 +69,7 @@ class Observed(NamedTuple):
         Their covariances [km^2]. The errors of different rows may be correlated, up to equal.
     """
 
-    time_ns: npt.NDArray[np.int64]
+    time_ns: Integers
     r_km: Array
     cov: Array
 
@@ -93,7 +91,7 @@ class KnownSatellites(NamedTuple):
     """
 
     satellites: Satellites
-    epoch_ns: npt.NDArray[np.int64]
+    epoch_ns: Integers
     low: ElementErrors
     high: ElementErrors
 
@@ -312,7 +310,7 @@ def judge(found: Sequence[Candidate], min_probability: float) -> NameVerdict:
     return NameVerdict("unknown", float(1.0 - share.sum()), nearest)
 
 
-def spread_rows(time_ns: npt.NDArray[np.int64], preferred: npt.NDArray[np.bool_]) -> Indices:
+def spread_rows(time_ns: Integers, preferred: Flags) -> Indices:
     """Return at most `MAX_ROWS` rows, evenly spread over the time and in its order.
 
     Only preferred rows, if there are any.

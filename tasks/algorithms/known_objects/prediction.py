@@ -15,17 +15,14 @@ from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 from sgp4.api import WGS72, Satrec, SatrecArray
 
+from epipole.schemas.arrays import Array, Indices, Nanoseconds
 from epipole.tasks.algorithms.constants import GM_KM3_S2, SPEED_OF_LIGHT_KM_S
 from epipole.tasks.algorithms.orbits.reference_frames import Orientation, gcrf_from_teme
 from epipole.tasks.algorithms.times import utc_julian_date
 
-Array = npt.NDArray[np.float64]
-Nanoseconds = npt.NDArray[np.int64]
 Satellites = Sequence[Satrec]
-Indices = npt.NDArray[np.int64]
 
 DAY_S = 86400.0
 UNIX_EPOCH_JD = 2440587.5

@@ -14,10 +14,10 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
+from epipole.schemas.arrays import Array
 from epipole.tasks.algorithms.constants import SECOND_NS
-from epipole.tasks.algorithms.known_objects.matching import KnownSatellites
+from epipole.tasks.algorithms.known_objects.matching import SURE, KnownSatellites
 from epipole.tasks.algorithms.known_objects.tracklet_matching import (
     ErrorsOfPairs,
     judge_tracklets,
@@ -27,9 +27,6 @@ from epipole.tasks.algorithms.known_objects.tracklet_matching import (
 )
 from epipole.tasks.algorithms.known_objects.tracklet_search import Pairs, SeenTracklets
 
-Array = npt.NDArray[np.float64]
-
-SURE = 0.999  # probability of a name that counts
 # Fewer known satellites than this share of the tracklets, and other offsets are tried. A catalogue
 # that has one in ten objects is spared that; times that are 4 s off leave one in twenty known.
 FEW_KNOWN = 0.1

@@ -19,6 +19,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.special import logsumexp
 
+from epipole.schemas.arrays import Array, Flags, Indices
 from epipole.tasks.algorithms.constants import DAY_NS, DAY_S, GM_KM3_S2, LN_2PI, SPEED_OF_LIGHT_KM_S
 from epipole.tasks.algorithms.known_objects.matching import (
     COMPANIONS,
@@ -37,9 +38,6 @@ from epipole.tasks.algorithms.known_objects.prediction import (
     sigmas_of,
 )
 from epipole.tasks.algorithms.known_objects.tracklet_search import Pairs, SeenTracklets, find_pairs
-
-Array = npt.NDArray[np.float64]
-Indices = npt.NDArray[np.int64]
 
 REACH_SIGMAS = 4.0
 # Unrelated objects: their density on the sky, all tracked ones in low orbit as seen from there; and
@@ -65,7 +63,7 @@ class PairWeights(NamedTuple):
     log_match: Array
     log_companion: Array
     log_other: Array
-    fits: npt.NDArray[np.bool_]
+    fits: Flags
 
 
 class TrackletResidual(NamedTuple):

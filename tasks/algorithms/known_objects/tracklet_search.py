@@ -14,15 +14,12 @@ import numpy as np
 import numpy.typing as npt
 from sgp4.api import SatrecArray
 
+from epipole.schemas.arrays import Array, Flags, Indices, Nanoseconds
 from epipole.tasks.algorithms.constants import EARTH_RADIUS_KM, GM_KM3_S2, SECOND_NS
 from epipole.tasks.algorithms.geometry.directions import east_north, unit_from_radec
 from epipole.tasks.algorithms.kernels import borrowing_kernel, inlined_kernel, kernel
 from epipole.tasks.algorithms.known_objects.prediction import Satellites, predict_all, predict_each
 from epipole.tasks.algorithms.times import direction_to_sun
-
-Array = npt.NDArray[np.float64]
-Nanoseconds = npt.NDArray[np.int64]
-Indices = npt.NDArray[np.int64]
 
 # Cubics between the nodes are up to 4 km off in low orbit. During a slice, motion is a straight
 # line, up to 1 km off.
@@ -103,7 +100,7 @@ class Pairs(NamedTuple):
     satellite: Indices
     states: Array
 
-    def take(self, which: npt.NDArray[np.bool_] | Indices | slice) -> "Pairs":
+    def take(self, which: Flags | Indices | slice) -> "Pairs":
         """Return some of the pairs."""
         return Pairs._make(column[which] for column in self)
 
@@ -359,7 +356,7 @@ def _fits(lines, i, dt, states, k, reach_km, satellite):
     return ex * ex + ey * ey + ez * ez < allowed * allowed
 
 
-def _may_be_seen(tracklets: SeenTracklets, pairs: Pairs) -> npt.NDArray[np.bool_]:
+def _may_be_seen(tracklets: SeenTracklets, pairs: Pairs) -> Flags:
     """Return whether each satellite is in sunlight, before the Earth, and not too bright."""
     r_km, from_km = pairs.states[:, :3], tracklets.r_km[pairs.tracklet]
     to_sun = direction_to_sun(tracklets.time_ns)[pairs.tracklet]

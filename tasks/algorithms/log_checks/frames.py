@@ -3,8 +3,8 @@
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
+from epipole.schemas.arrays import Array, Integers, Nanoseconds
 from epipole.tasks.algorithms.constants import SECOND_NS
 from epipole.tasks.algorithms.log_checks.findings import (
     COVERAGE,
@@ -19,10 +19,6 @@ from epipole.tasks.algorithms.log_checks.findings import (
     WRONG,
     Finding,
 )
-
-Array = npt.NDArray[np.float64]
-Nanoseconds = npt.NDArray[np.int64]
-Integers = npt.NDArray[np.int64]
 
 # Offsets between time scales in use, and of clocks that show local time: GPS and TAI minus UTC,
 # TAI minus GPS, hours.

@@ -10,13 +10,10 @@ rotations, which no arc shows.
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 from numpy.polynomial.chebyshev import chebder, chebfit, chebint, chebval, chebvander
 
+from epipole.schemas.arrays import Array, Flags, Nanoseconds
 from epipole.tasks.algorithms.constants import EARTH_RADIUS_KM, GM_KM3_S2, J2, SECOND_NS
-
-Array = npt.NDArray[np.float64]
-Nanoseconds = npt.NDArray[np.int64]
 
 MIN_STATES = 5  # of an arc: three are fitted on each axis
 # A low orbit turns by a third of a radian in five minutes, which a polynomial follows to a metre.
@@ -226,9 +223,7 @@ def _integrals(path: Array, half_s: float, rate_rad_s: Array) -> tuple[Array, Ar
     return once, twice
 
 
-def _polynomial(
-    tau: Array, r: Array, degree: int, used: npt.NDArray[np.bool_]
-) -> tuple[Array, Array]:
+def _polynomial(tau: Array, r: Array, degree: int, used: Flags) -> tuple[Array, Array]:
     """Return the Chebyshev coefficients of the best polynomial, and its values at all times."""
     width = max(float(np.abs(tau).max()), 1e-9)
     fitted = chebfit(tau[used] / width, r[used], degree)

@@ -11,14 +11,10 @@ from itertools import combinations, permutations, product
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
+from epipole.schemas.arrays import Array, Flags, Integers
 from epipole.tasks.algorithms.constants import EARTH_RATE_RAD_S
 from epipole.tasks.algorithms.earth_gravity import propagate_states
-
-Array = npt.NDArray[np.float64]
-Integers = npt.NDArray[np.int64]
-Mask = npt.NDArray[np.bool_]
 
 GATE = 3.0  # sigmas of the distance from the plane
 UNRELATED_RAD = 0.02  # views that have nothing in common miss each other by about this, or more
@@ -121,7 +117,7 @@ def shares_that_meet(sights: Sights) -> Array:
 
 
 def _best(
-    sights: Sights, tried: list[_Tried], stated_odds: Array, stated: Mask, concerned: Mask
+    sights: Sights, tried: list[_Tried], stated_odds: Array, stated: Flags, concerned: Flags
 ) -> list[NamedReading]:
     """Return the reading that wins beyond doubt, if any."""
     n_epochs = len(np.unique(sights.epoch))
@@ -144,7 +140,7 @@ def _best(
     return [NamedReading(best.cause, best.sensor, best.other, *shares, gain, best.offset_s)]
 
 
-def _odds(sights: Sights, r_km: Array, concerned: Mask | None = None) -> tuple[Array, Mask]:
+def _odds(sights: Sights, r_km: Array, concerned: Flags | None = None) -> tuple[Array, Flags]:
     """Return the log odds (n,) that each view meets one of another sensor, and whether it does.
 
     Only of the views concerned, if given.
@@ -163,7 +159,7 @@ def _odds(sights: Sights, r_km: Array, concerned: Mask | None = None) -> tuple[A
     return np.minimum(odds, -np.log(1e-3)), meets
 
 
-def _pairs(sights: Sights, r_km: Array, a: Integers, b: Integers) -> tuple[Mask, Array]:
+def _pairs(sights: Sights, r_km: Array, a: Integers, b: Integers) -> tuple[Flags, Array]:
     """Return which of views a and b of one epoch meet (m, k), and how probable that is anyway."""
     u_a, u_b = sights.u[a], sights.u[b]
     d = r_km[b][None, :, :] - r_km[a][:, None, :]

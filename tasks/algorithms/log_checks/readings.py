@@ -8,8 +8,8 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
+from epipole.schemas.arrays import Array
 from epipole.tasks.algorithms.constants import EARTH_RADIUS_KM, EARTH_RATE_RAD_S
 from epipole.tasks.algorithms.earth_gravity import LOWEST_ORBIT_KM
 from epipole.tasks.algorithms.log_checks.free_fall import (
@@ -19,8 +19,6 @@ from epipole.tasks.algorithms.log_checks.free_fall import (
     fall_of_velocities,
     read_arc,
 )
-
-Array = npt.NDArray[np.float64]
 
 SCALES = (1.0, 1e-3)  # kilometres, metres
 INERTIAL = np.zeros(3)

@@ -4,8 +4,8 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
+from epipole.schemas.arrays import Array, Flags, Nanoseconds
 from epipole.tasks.algorithms.constants import EARTH_RADIUS_KM, GM_KM3_S2
 from epipole.tasks.algorithms.log_checks.findings import (
     ONE_SENSOR,
@@ -37,9 +37,6 @@ from epipole.tasks.algorithms.log_checks.readings import (
     read_arcs,
 )
 from epipole.tasks.algorithms.log_checks.velocities import check_velocities
-
-Array = npt.NDArray[np.float64]
-Nanoseconds = npt.NDArray[np.int64]
 
 MIN_SCATTER_STATES = 20  # fewer tell no scatter
 SCATTER_RATIO = 5.0  # of the scatter to the stated sigma: no sigma of a sound log is that small
@@ -249,7 +246,7 @@ def _two_paths(states: LogStates) -> Finding:
     return found._replace(verdict=WRONG, value=int(second.sum()), cause="two_sensors", facts=facts)
 
 
-def _second_path(r_km: Array) -> npt.NDArray[np.bool_]:
+def _second_path(r_km: Array) -> Flags:
     """Return which states belong to a second path; none where one path is enough.
 
     A state far from the last one begins the second path; from there on each belongs to the nearer
@@ -278,7 +275,7 @@ def _second_path(r_km: Array) -> npt.NDArray[np.bool_]:
     return second
 
 
-def _apart(r_km: Array, second: npt.NDArray[np.bool_]) -> float:
+def _apart(r_km: Array, second: Flags) -> float:
     """Return the typical distance of states that follow each other on different paths [km]."""
     switch = np.flatnonzero(np.diff(second.astype(int)))
     return float(np.median(np.linalg.norm(r_km[switch + 1] - r_km[switch], axis=1)))

@@ -4,8 +4,8 @@ from collections.abc import Sequence
 from itertools import permutations, product
 
 import numpy as np
-import numpy.typing as npt
 
+from epipole.schemas.arrays import Array
 from epipole.tasks.algorithms.constants import GM_KM3_S2
 from epipole.tasks.algorithms.log_checks.findings import (
     SOUND,
@@ -16,8 +16,6 @@ from epipole.tasks.algorithms.log_checks.findings import (
 )
 from epipole.tasks.algorithms.log_checks.free_fall import ReadArc, fall
 from epipole.tasks.algorithms.log_checks.readings import EARTH_FIXED
-
-Array = npt.NDArray[np.float64]
 
 FAR = 3.0  # times what is allowed: beyond doubt
 SIGMAS = 5.0

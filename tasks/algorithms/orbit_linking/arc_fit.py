@@ -3,16 +3,13 @@
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
+from epipole.schemas.arrays import Array, Indices
 from epipole.tasks.algorithms.constants import GM_KM3_S2, LN_2PI, SPEED_OF_LIGHT_KM_S
 from epipole.tasks.algorithms.earth_gravity import advance
 from epipole.tasks.algorithms.kernels import kernel
 from epipole.tasks.algorithms.orbit_linking.population import COMPONENTS, prior_of
 from epipole.tasks.algorithms.symmetric_matrices import factor, solve_factored
-
-Array = npt.NDArray[np.float64]
-Indices = npt.NDArray[np.int64]
 
 STEP_S = 60.0  # longest step of the propagation: right to 5 m in half an hour of a low orbit
 ITERATIONS = 12  # of Gauss and Newton; a fit that needs more fails

@@ -9,15 +9,12 @@ with the direction and the rates that each orbit has at their time (`near_trackl
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 from scipy.spatial import cKDTree
 
+from epipole.schemas.arrays import Array, Indices
 from epipole.tasks.algorithms.earth_gravity import advance
 from epipole.tasks.algorithms.kernels import kernel
 from epipole.tasks.algorithms.orbit_linking.arc_fit import MIN_COSINE, STEP_S, Tracklets
-
-Array = npt.NDArray[np.float64]
-Indices = npt.NDArray[np.int64]
 
 BLOCK_S = 600.0  # length of a block: the orbits that begin in it are propagated to its middle
 # Largest distance of two orbits that are compared [km, km/s]. Estimated: an orbit from two

@@ -15,8 +15,8 @@ two, are the difference of the log evidences.
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
+from epipole.schemas.arrays import Array, Flags, Indices
 from epipole.tasks.algorithms.earth_gravity import advance
 from epipole.tasks.algorithms.kernels import kernel
 from epipole.tasks.algorithms.orbit_linking.arc_fit import (
@@ -44,9 +44,6 @@ from epipole.tasks.algorithms.orbit_linking.pair_search import (
     packed_tracklets,
 )
 from epipole.tasks.algorithms.orbit_linking.population import log_attributable_density
-
-Array = npt.NDArray[np.float64]
-Indices = npt.NDArray[np.int64]
 
 NONE = -1  # no tracklet
 # Longest gap that pairs of any eccentricity are searched over; longer ones are `height_search`.
@@ -168,7 +165,7 @@ def link_tracklets(
     return LinkedTracklets(sets.root, epoch_s, state)
 
 
-def _stays(known: Indices) -> npt.NDArray[np.bool_]:
+def _stays(known: Indices) -> Flags:
     """Return which tracklets belong to a known object of several: no join releases them."""
     count = np.bincount(np.maximum(known, 0), known >= 0)
     return np.asarray((known >= 0) & (count[np.maximum(known, 0)] > 1))

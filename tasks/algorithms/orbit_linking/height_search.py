@@ -14,8 +14,8 @@ at which both tracklets, each by its direction and rates, may be nearly circular
 """
 
 import numpy as np
-import numpy.typing as npt
 
+from epipole.schemas.arrays import Array, Indices
 from epipole.tasks.algorithms.constants import EARTH_RADIUS_KM, GM_KM3_S2
 from epipole.tasks.algorithms.earth_gravity import advance
 from epipole.tasks.algorithms.kernels import borrowing_kernel, kernel
@@ -32,9 +32,6 @@ from epipole.tasks.algorithms.orbit_linking.pair_search import (
     with_room,
 )
 from epipole.tasks.algorithms.orbit_linking.population import MIN_HEIGHT_KM
-
-Array = npt.NDArray[np.float64]
-Indices = npt.NDArray[np.int64]
 
 # Distances from the geocentre [km]: even steps among low orbits, then steps of a ratio.
 LOWEST_KM, LOW_KM, HIGHEST_KM = 6500.0, 8500.0, 46_000.0

@@ -11,16 +11,13 @@ the coefficients of a circular orbit at the sensor's height.
 from collections.abc import Callable
 
 import numpy as np
-import numpy.typing as npt
 
+from epipole.schemas.arrays import Array, Indices
 from epipole.tasks.algorithms.constants import EARTH_RADIUS_KM, ESCAPE_SPEED_KM_S, GM_KM3_S2, J2
 from epipole.tasks.algorithms.kernels import borrowing_kernel
 from epipole.tasks.algorithms.orbit_linking.arc_fit import Tracklets
 from epipole.tasks.algorithms.orbit_linking.population import MIN_HEIGHT_KM
 from epipole.tasks.algorithms.symmetric_matrices import invert_symmetric
-
-Array = npt.NDArray[np.float64]
-Indices = npt.NDArray[np.int64]
 
 # Solutions, each with the coefficients of the orbit of the one before. With 2, bench_orbit_linking
 # takes up to twice the time, and joins some sets differently.

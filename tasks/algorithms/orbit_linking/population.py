@@ -6,12 +6,10 @@ the others have any eccentricity. The directions of motion are uniform.
 """
 
 import numpy as np
-import numpy.typing as npt
 
+from epipole.schemas.arrays import Array
 from epipole.tasks.algorithms.constants import EARTH_RADIUS_KM, GM_KM3_S2
 from epipole.tasks.algorithms.kernels import kernel
-
-Array = npt.NDArray[np.float64]
 
 # Objects of 10 cm and more: ESA's Annual Space Environment Report 2025 has some 40,000 tracked ones
 # and 54,000 by model. More objects mean more chance meetings: this is the careful end.

@@ -8,8 +8,8 @@ from typing import NamedTuple
 
 import erfa
 import numpy as np
-import numpy.typing as npt
 
+from epipole.schemas.arrays import Array
 from epipole.tasks.algorithms.constants import (
     AU_KM,
     C22,
@@ -28,8 +28,6 @@ from epipole.tasks.algorithms.constants import (
 )
 from epipole.tasks.algorithms.kernels import kernel
 from epipole.tasks.algorithms.times import tt_julian_date, utc_julian_date
-
-Array = npt.NDArray[np.float64]
 
 N_AREAS = 2  # areas over mass that are unknowns: in sunlight, in the air
 N_UNKNOWNS = 6 + N_AREAS

@@ -3,12 +3,10 @@
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
+from epipole.schemas.arrays import Array, Flags, Integers
 from epipole.tasks.algorithms.constants import AU_KM, EARTH_RADIUS_KM
 from epipole.tasks.algorithms.times import direction_to_sun
-
-Array = npt.NDArray[np.float64]
 
 REFERENCE_KM = 1000.0  # distance to which magnitudes are reduced
 
@@ -26,10 +24,10 @@ class Illumination(NamedTuple):
 
     range_km: Array
     phase_rad: Array
-    sunlit: npt.NDArray[np.bool_]
+    sunlit: Flags
 
 
-def illumination(time_ns: npt.NDArray[np.int64], r_km: Array, sensor_km: Array) -> Illumination:
+def illumination(time_ns: Integers, r_km: Array, sensor_km: Array) -> Illumination:
     """Return how objects are lit and seen.
 
     Parameters

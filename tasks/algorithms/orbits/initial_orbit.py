@@ -7,8 +7,8 @@ tried; each gives an orbit, which is compared with the directions between.
 """
 
 import numpy as np
-import numpy.typing as npt
 
+from epipole.schemas.arrays import Array, Indices
 from epipole.tasks.algorithms.constants import GM_KM3_S2
 from epipole.tasks.algorithms.earth_gravity import LOWEST_ORBIT_KM, gravity, propagate_states
 from epipole.tasks.algorithms.orbits.forces import Surroundings
@@ -17,9 +17,6 @@ from epipole.tasks.algorithms.orbits.orbit_determination import (
     ObjectDirections,
     determine_orbit,
 )
-
-Array = npt.NDArray[np.float64]
-Indices = npt.NDArray[np.int64]
 
 LONGEST_S = 600.0  # between the two directions: beyond it one pair of distances has many orbits
 DISTANCES_KM = np.geomspace(50.0, 60_000.0, 48)  # 16 % apart, which the fit converges from

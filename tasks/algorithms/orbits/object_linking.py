@@ -9,14 +9,12 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 from scipy.special import gammaincinv, gammaln
 
+from epipole.schemas.arrays import Array, Flags, Indices
 from epipole.tasks.algorithms.constants import GM_KM3_S2
 from epipole.tasks.algorithms.orbits.orbit_fit import trajectory
 
-Array = npt.NDArray[np.float64]
-Indices = npt.NDArray[np.int64]
 # Returns the last state of an object after times (m,) [s], (m, 6), with covariances (m, 6, 6).
 Mover = Callable[[int, Array], tuple[Array, Array]]
 
@@ -61,7 +59,7 @@ def link_by_motion(
     *,
     gap_s: float,
     log_odds: float,
-    allowed: npt.NDArray[np.bool_] | None = None,
+    allowed: Flags | None = None,
     moved: Mover | None = None,
 ) -> tuple[Indices, Array]:
     """Return which earlier object each object continues.
@@ -126,7 +124,7 @@ class _CandidatePairs(NamedTuple):
 def _pairs(
     motions: ObservedMotions,
     gap_s: float,
-    allowed: npt.NDArray[np.bool_] | None = None,
+    allowed: Flags | None = None,
     moved: Mover | None = None,
 ) -> _CandidatePairs:
     """Return the pairs that may be one object, by time and energy, with their differences."""
@@ -162,7 +160,7 @@ def _pairs(
     return _CandidatePairs(*(np.concatenate(column) for column in zip(*parts, strict=True)))
 
 
-def _energies_agree(motions: ObservedMotions) -> npt.NDArray[np.bool_]:
+def _energies_agree(motions: ObservedMotions) -> Flags:
     """Return which (earlier, later) pairs agree in energy; true where either is unknown.
 
     A fast, wide gate: two-body motion keeps the energy, and J2 changes it by a thousandth.

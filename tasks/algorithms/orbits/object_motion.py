@@ -11,18 +11,13 @@ from collections import defaultdict
 from collections.abc import Sequence
 
 import numpy as np
-import numpy.typing as npt
 
+from epipole.schemas.arrays import Array, Indices, Integers
 from epipole.tasks.algorithms.earth_gravity import gravity
 from epipole.tasks.algorithms.kernels import kernel
 
-Array = npt.NDArray[np.float64]
-Indices = npt.NDArray[np.int64]
 
-
-def velocities(
-    offsets: npt.NDArray[np.int64], time_s: Array, r_km: Array, half_s: float
-) -> tuple[Array, Array]:
+def velocities(offsets: Integers, time_s: Array, r_km: Array, half_s: float) -> tuple[Array, Array]:
     """Return each position's velocity: the slope of its object's positions around it.
 
     Parameters
@@ -168,7 +163,7 @@ class ObjectRegistry:
         often.
     """
 
-    def __init__(self, weight: npt.NDArray[np.float64] | None = None) -> None:
+    def __init__(self, weight: Array | None = None) -> None:
         self._weight = weight
         self._object_of: dict[int, int] = {}
         self._count = 0

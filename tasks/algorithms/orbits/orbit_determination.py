@@ -10,8 +10,8 @@ and takes in the others by and by, so that it converges over many revolutions.
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
+from epipole.schemas.arrays import Array, Flags, Indices
 from epipole.tasks.algorithms.constants import (
     EARTH_RADIUS_KM,
     GM_KM3_S2,
@@ -25,10 +25,6 @@ from epipole.tasks.algorithms.orbits.trajectories import (
     interpolate,
     propagate_unknowns,
 )
-
-Array = npt.NDArray[np.float64]
-Indices = npt.NDArray[np.int64]
-Mask = npt.NDArray[np.bool_]
 
 N_SHARED = 6  # unknowns of a sensor: direction [rad], then position [km]
 ITERATIONS = 30
@@ -119,7 +115,7 @@ class DeterminedOrbit(NamedTuple):
     unknowns: Array
     cov: Array
     chi2: float
-    used: Mask
+    used: Flags
     shared: Array
     of_directions: Array
     equations: ArcEquations
@@ -233,7 +229,7 @@ class _Point(NamedTuple):
 
 
 def _at(
-    unknowns: Array, shared: Array, epoch_s: float, directions: ObjectDirections, used: Mask,
+    unknowns: Array, shared: Array, epoch_s: float, directions: ObjectDirections, used: Flags,
     areas: AreaPrior, around: Surroundings,
 ) -> _Point:  # fmt: skip
     """Return the sums of all directions at given unknowns; an infinite chi-square if invalid."""
@@ -318,7 +314,7 @@ def _velocity_prior(state: Array) -> tuple[Array, Array]:
 
 
 def _converge(
-    unknowns: Array, shared: Array, epoch_s: float, directions: ObjectDirections, used: Mask,
+    unknowns: Array, shared: Array, epoch_s: float, directions: ObjectDirections, used: Flags,
     areas: AreaPrior, around: Surroundings,
 ) -> tuple[_Point, Array] | None:  # fmt: skip
     """Return the least-squares point and its covariance; None if it is not found."""
@@ -438,11 +434,11 @@ def neglected(r_km: Array, arc_s: float) -> Array:
     return np.diag(np.repeat([sigma_km, NEGLECTED_RATE * motion * sigma_km], 3) ** 2)
 
 
-def _windows(time_s: Array, start_s: float) -> list[Mask]:
+def _windows(time_s: Array, start_s: float) -> list[Flags]:
     """Return growing sets of directions around the initial state; without that of all."""
     away = np.abs(time_s - start_s)
     window_s = max(FIRST_WINDOW_S, float(np.sort(away)[MIN_DIRECTIONS - 1]))
-    rows: list[Mask] = []
+    rows: list[Flags] = []
     while (away > window_s).any():
         inside = away <= window_s
         if not rows or inside.sum() > rows[-1].sum():
@@ -451,7 +447,7 @@ def _windows(time_s: Array, start_s: float) -> list[Mask]:
     return rows
 
 
-def part_of(directions: ObjectDirections, rows: Mask) -> ObjectDirections:
+def part_of(directions: ObjectDirections, rows: Flags) -> ObjectDirections:
     """Return some of the directions. The sensors keep their numbers."""
     time_s, sensor, r_km, u, basis, weight, prior = directions
     return ObjectDirections(

@@ -8,16 +8,13 @@ not average out over the arc; only independent errors do.
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
+from epipole.schemas.arrays import Array, Indices
 from epipole.tasks.algorithms.constants import GM_KM3_S2, SPEED_OF_LIGHT_KM_S
 from epipole.tasks.algorithms.earth_gravity import advance
 from epipole.tasks.algorithms.geometry.directions import tangent_basis
 from epipole.tasks.algorithms.kernels import kernel
 from epipole.tasks.algorithms.orbits.shared_errors import ArcEquations, no_equations
-
-Array = npt.NDArray[np.float64]
-Indices = npt.NDArray[np.int64]
 
 LIGHT = SPEED_OF_LIGHT_KM_S
 STEP_S = 10.0  # longest step of the propagation: right to 1 m over 10 minutes of a low orbit

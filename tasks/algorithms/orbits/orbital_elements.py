@@ -3,16 +3,14 @@
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
+from epipole.schemas.arrays import Array
 from epipole.tasks.algorithms.constants import (
     EARTH_RATE_RAD_S,
     GM_KM3_S2,
 )
 from epipole.tasks.algorithms.orbits.forces import Surroundings
 from epipole.tasks.algorithms.orbits.trajectories import propagate_unknowns
-
-Array = npt.NDArray[np.float64]
 
 # Steps of the numerical derivatives: a share of the position and of the velocity, at which
 # rounding and curvature are both below 1e-6 of the derivative.

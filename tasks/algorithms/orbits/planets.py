@@ -5,15 +5,12 @@ from typing import NamedTuple
 
 import erfa
 import numpy as np
-import numpy.typing as npt
 from scipy.interpolate import CubicSpline
 
+from epipole.schemas.arrays import Array, Nanoseconds
 from epipole.tasks.algorithms.constants import ARCSEC, AU_KM, SPEED_OF_LIGHT_KM_S
 from epipole.tasks.algorithms.geometry.directions import aberrate
 from epipole.tasks.algorithms.times import tt_julian_date
-
-Array = npt.NDArray[np.float64]
-Nanoseconds = npt.NDArray[np.int64]
 
 NUMBERS = (1, 2, 4, 5, 6, 7, 8)  # of plan94: Mercury, Venus, Mars ... Neptune
 

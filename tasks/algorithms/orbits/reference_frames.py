@@ -13,19 +13,24 @@ from typing import NamedTuple
 
 import erfa
 import numpy as np
-import numpy.typing as npt
 
+from epipole.schemas.arrays import Array, Nanoseconds
 from epipole.tasks.algorithms.constants import EARTH_RATE_RAD_S
 from epipole.tasks.algorithms.times import tai_minus_utc_s, tt_julian_date, utc_julian_date
-
-Array = npt.NDArray[np.float64]
-Nanoseconds = npt.NDArray[np.int64]
 
 EME2000_FROM_GCRF: Array = erfa.bp06(2451545.0, 0.0)[0]  # rotation matrix: the frame bias
 FRAMES = ("GCRF", "EME2000", "TEME", "ITRF")
 MJD_JD = 2400000.5
 # The fastest term of nutation takes days: linear over ten minutes to 1e-6 arcsec.
 NODE_NS = 600_000_000_000
+
+
+def state_rotation(rotation: Array) -> Array:
+    """Return the (6, 6) rotation of positions and velocities by a (3, 3) rotation.
+
+    Not for axes that turn: there the velocity of the axes is missing.
+    """
+    return np.asarray(np.kron(np.eye(2), rotation), float)
 
 
 class Orientation(NamedTuple):

@@ -8,14 +8,12 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 from scipy.sparse import coo_array, csr_array
 from scipy.sparse.csgraph import connected_components
 
+from epipole.schemas.arrays import Array, Indices
 from epipole.tasks.algorithms.orbits.shared_errors import ArcEquations, without_state
 
-Array = npt.NDArray[np.float64]
-Indices = npt.NDArray[np.int64]
 Entries = tuple[Indices, Indices, Array]  # of a sparse matrix: rows, columns, values
 
 N_SHARED = 6  # unknowns of a sensor: direction [rad], then position [km]

@@ -10,10 +10,8 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
-Array = npt.NDArray[np.float64]
-Indices = npt.NDArray[np.int64]
+from epipole.schemas.arrays import Array, Flags, Indices
 
 FREEDOM = 4.0  # degrees of freedom of the Student distribution: 1 error in 90 beyond five sigma
 AXES = 3
@@ -58,7 +56,7 @@ def no_equations(n_sensors: int) -> ArcEquations:
 
 
 def scale_shared_errors(
-    arcs: Sequence[tuple[Indices, ArcEquations]], prior: Array, free: npt.NDArray[np.bool_]
+    arcs: Sequence[tuple[Indices, ArcEquations]], prior: Array, free: Flags
 ) -> Array:
     """Return the factors of the stated variances of sensors' shared errors.
 
@@ -166,7 +164,7 @@ def without_state(arc: ArcEquations) -> tuple[Array, Array]:
     return reduced, arc.of_sensors.ravel() - to_state @ (inverse @ arc.of_state)
 
 
-def _scaled(normal: Array, right: Array, prior: Array, free: npt.NDArray[np.bool_]) -> Array:
+def _scaled(normal: Array, right: Array, prior: Array, free: Flags) -> Array:
     """Return the variance factors (s, 2) of sensors from the equations of their errors."""
     n_sensors = len(prior)
     factor = np.ones((n_sensors, 2))

@@ -13,15 +13,11 @@ state per second a point at rest on Earth is still right to a metre.
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
+from epipole.schemas.arrays import Array, Flags, Nanoseconds
 from epipole.tasks.algorithms.constants import SECOND_NS
 from epipole.tasks.algorithms.earth_gravity import gravity, propagate_states
 from epipole.tasks.algorithms.geometry.directions import interpolate_quaternions
-
-Array = npt.NDArray[np.float64]
-Nanoseconds = npt.NDArray[np.int64]
-Mask = npt.NDArray[np.bool_]
 
 # Largest gap between two states that is interpolated. With reported velocities the quintic of a low
 # orbit is then right to 5 cm. Fitted velocities have errors of some m/s.
@@ -168,7 +164,7 @@ def _fit_velocities(states: SensorStates, which: Nanoseconds) -> tuple[Array, Ar
     return v, np.stack([-2 * mean_s / spread, 1 / spread], axis=-1)
 
 
-def _fit_points(time_ns: Nanoseconds, which: Nanoseconds) -> tuple[Nanoseconds, Mask]:
+def _fit_points(time_ns: Nanoseconds, which: Nanoseconds) -> tuple[Nanoseconds, Flags]:
     """Return (k, FIT_POINTS) indices of the states around each of k, and which are used."""
     n = len(time_ns)
     reach = int(FIT_HALF_WIDTH_S * SECOND_NS)

@@ -7,9 +7,9 @@ unknowns are the state at the epoch and two areas over mass.
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 from scipy.integrate import DOP853
 
+from epipole.schemas.arrays import Array
 from epipole.tasks.algorithms.constants import EARTH_RADIUS_KM, GM_KM3_S2
 from epipole.tasks.algorithms.kernels import kernel
 from epipole.tasks.algorithms.orbits.forces import (
@@ -18,8 +18,6 @@ from epipole.tasks.algorithms.orbits.forces import (
     accelerate,
     gravity_gradient,
 )
-
-Array = npt.NDArray[np.float64]
 
 N_VALUES = 6 + 6 * N_UNKNOWNS  # a state, and its derivatives row by row
 # Steps of this share of the time in which a circular orbit at the perigee turns by one radian:

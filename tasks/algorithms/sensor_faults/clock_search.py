@@ -8,14 +8,11 @@ offsets of false pairs scatter, those of true pairs are equal.
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 from scipy.special import pdtrc
 
+from epipole.schemas.arrays import Array, Indices
 from epipole.tasks.algorithms.geometry.directions import tangent_basis
 from epipole.tasks.algorithms.sensor_faults.fault_judgement import MIN_OBJECTS
-
-Array = npt.NDArray[np.float64]
-Indices = npt.NDArray[np.int64]
 
 MAX_OFFSET_S = 5.0  # largest clock offset that is searched
 # Largest residual of a line and its object at the best offset. With twice of it the same offsets

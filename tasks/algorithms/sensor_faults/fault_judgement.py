@@ -21,14 +21,10 @@ from collections.abc import Iterator
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
+from epipole.schemas.arrays import Array, Flags, Indices
 from epipole.tasks.algorithms.constants import ARCSEC, GM_KM3_S2
 from epipole.tasks.algorithms.geometry.directions import skew, tangent_basis
-
-Array = npt.NDArray[np.float64]
-Indices = npt.NDArray[np.int64]
-Flags = npt.NDArray[np.bool_]
 
 PRIOR_S = 10.0  # 1-sigma prior of a wrong clock's offset
 SOUND_S = 1e-3  # 1-sigma prior of a right clock's offset

@@ -11,8 +11,8 @@ other sensors are in its field. `agreement` finds these sensors.
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
+from epipole.schemas.arrays import Array, Flags, Indices
 from epipole.tasks.algorithms.association.odds import seeing
 from epipole.tasks.algorithms.association.samples import FREE, Groups, Samples
 from epipole.tasks.algorithms.geometry.triangulation import triangulate
@@ -33,9 +33,6 @@ from epipole.tasks.algorithms.sensor_faults.fault_judgement import (
     shift_lines,
     whitened,
 )
-
-Array = npt.NDArray[np.float64]
-Indices = npt.NDArray[np.int64]
 
 MAX_TOGETHER = 24  # maximum number of sensors that are judged together
 MAX_ROUNDS = 4  # each round judges the next suspects, without the sensors already at fault
@@ -113,7 +110,7 @@ def _nothing_known(n: int) -> JudgedSensors:
     )
 
 
-def _of_other_sensors(lines: Lines, faulty: npt.NDArray[np.bool_]) -> Lines:
+def _of_other_sensors(lines: Lines, faulty: Flags) -> Lines:
     """Return the lines of the other sensors."""
     kept = ~faulty[lines.sensor]
     return lines._replace(**{name: getattr(lines, name)[kept] for name in Lines._fields})
@@ -236,12 +233,12 @@ class Agreement(NamedTuple):
     n_unassigned: Indices
 
     @property
-    def judged(self) -> npt.NDArray[np.bool_]:
+    def judged(self) -> Flags:
         """(s,) bool: enough objects of the others were in the sensor's field."""
         return np.asarray(self.n_in_field >= MIN_OBJECTS)
 
     @property
-    def doubted(self) -> npt.NDArray[np.bool_]:
+    def doubted(self) -> Flags:
         """(s,) bool: the sensor joins too few objects of the others."""
         few = self.n_joined < MIN_JOINED_SHARE * self.n_in_field
         return np.asarray(few & self.judged)

@@ -5,9 +5,9 @@ from typing import Any, NamedTuple
 
 import erfa
 import numpy as np
-import numpy.typing as npt
 from sgp4.api import SGP4_ERRORS, WGS72, Satrec, SatrecArray
 
+from epipole.schemas.arrays import Array, Flags, Nanoseconds
 from epipole.tasks.algorithms.simulation.constants import (
     AU_KM,
     DAY_S,
@@ -20,8 +20,6 @@ from epipole.tasks.algorithms.simulation.constants import (
 
 # Time scales, and the Earth's barycentric position and velocity, for many times at once.
 
-Array = npt.NDArray[np.float64]
-Nanoseconds = npt.NDArray[np.int64]
 
 NODE_S = 1200  # [s] cubics between the series' values at this distance err by 1e-6 km
 DAY_NS = int(DAY_S) * SECOND_NS
@@ -185,7 +183,7 @@ def _satellite(elements: Sequence[float] | Array) -> Any:
     return satellite
 
 
-def _failures(bad: npt.NDArray[np.bool_], code: Any, time_ns: Nanoseconds) -> list[Failure]:
+def _failures(bad: Flags, code: Any, time_ns: Nanoseconds) -> list[Failure]:
     found = []
     for row in np.flatnonzero(bad.any(axis=1)).tolist():
         at = int(np.argmax(bad[row]))

@@ -11,6 +11,7 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
+from epipole.schemas.arrays import Array, Flags, Indices
 from epipole.tasks.algorithms.simulation.element_sets import (
     directions_to_sun,
     earth_at,
@@ -38,9 +39,6 @@ from epipole.tasks.algorithms.simulation.sources import (
     star_directions,
     stars_in_cones,
 )
-
-Array = npt.NDArray[np.float64]
-Indices = npt.NDArray[np.int64]
 
 STAR, TARGET, FALSE = 0, 1, 2
 MERGE_PX = 2.0  # stars closer than this are one spot
@@ -256,7 +254,7 @@ class Exposing:
         y_px: Array,
         earth_km_s: Array,
         v_observer: Array,
-    ) -> tuple[Array, Array, npt.NDArray[np.bool_]]:
+    ) -> tuple[Array, Array, Flags]:
         """Return what `_image` does for objects at the times of these rows."""
         r_km, R = readout.poses(frame, y_px)
         t_s = seconds_since(self.sensor.t0_ns, readout.times_ns(frame, y_px))
@@ -362,7 +360,7 @@ class Exposing:
         source = np.full(len(frame), -1)
         return true_spots(frame, x_y[:, 0], x_y[:, 1], magnitude, FALSE, source)
 
-    def _image(self, u: Array, R: Array) -> tuple[Array, Array, npt.NDArray[np.bool_]]:
+    def _image(self, u: Array, R: Array) -> tuple[Array, Array, Flags]:
         """Return columns and rows [px], and which directions are within the camera's cone."""
         in_sensor = np.einsum("nij,nj->ni", R, u)
         ok = in_sensor[:, 2] > np.cos(self._radius)

@@ -4,13 +4,11 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
+from epipole.schemas.arrays import Array, Flags
 from epipole.tasks.algorithms.simulation.constants import EARTH_RADIUS_KM, LIGHT_KM_S
 
 # The camera: directions in the sensor frame to pixel positions.
-
-Array = npt.NDArray[np.float64]
 
 
 class TrueOptics(NamedTuple):
@@ -57,7 +55,7 @@ def image_position(optics: TrueOptics, u: Array) -> tuple[Array, Array]:
     return optics.fx_px * x + optics.cx_px, optics.fy_px * y + optics.cy_px
 
 
-def on_image(optics: TrueOptics, x_px: Array, y_px: Array) -> npt.NDArray[np.bool_]:
+def on_image(optics: TrueOptics, x_px: Array, y_px: Array) -> Flags:
     """Return which positions are on the image; a pixel extends half a pixel about its centre."""
     return (np.abs(x_px - (optics.width - 1) / 2) < optics.width / 2) & (
         np.abs(y_px - (optics.height - 1) / 2) < optics.height / 2
@@ -142,9 +140,7 @@ def received_from(
     return d, r_sent
 
 
-def hidden_by_earth(
-    r_sensor_km: Array, u: Array, distance_km: Array | float
-) -> npt.NDArray[np.bool_]:
+def hidden_by_earth(r_sensor_km: Array, u: Array, distance_km: Array | float) -> Flags:
     """Return which lines of sight meet the Earth before they end.
 
     Parameters

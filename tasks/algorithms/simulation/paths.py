@@ -3,13 +3,11 @@
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
+from epipole.schemas.arrays import Array, Flags, Indices
 from epipole.tasks.algorithms.simulation.constants import GM_KM3_S2
 
 # Two-body orbits about the Earth.
-
-Array = npt.NDArray[np.float64]
 
 
 def eccentric_anomaly(mean: Array, e: Array) -> Array:
@@ -100,7 +98,6 @@ def elements_from_state(r_km: Array, v_km_s: Array) -> Array:
 
 # Sampled paths.
 
-Indices = npt.NDArray[np.int64]
 
 # [s] A cubic between nodes errs by step^4 / 384 of the fourth derivative, and a low orbit's is
 # 1e-8 km/s^4: less than a millimetre.
@@ -162,7 +159,7 @@ class Paths:
         return Paths(self.elements[part], row, nodes)
 
     @property
-    def is_sampled(self) -> npt.NDArray[np.bool_]:
+    def is_sampled(self) -> Flags:
         """Return which bodies have no elements."""
         return self.row >= 0
 

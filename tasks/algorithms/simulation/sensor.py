@@ -4,16 +4,14 @@ import zlib
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
+from epipole.schemas.arrays import Array, Flags, Integers, Nanoseconds
 from epipole.tasks.algorithms.simulation.constants import EARTH_RADIUS_KM, SECOND_NS
 from epipole.tasks.algorithms.simulation.optics import TrueOptics, hidden_by_earth
 from epipole.tasks.algorithms.simulation.paths import Paths
 
 # Pointing: attitudes that track an object, stay fixed, spin or jump.
-
-Array = npt.NDArray[np.float64]
 
 
 def look_along(z: Array, up: Array, roll_rad: float = 0.0) -> Rotation:
@@ -94,8 +92,6 @@ def random_attitudes(
 
 # Exposures and reported states.
 
-Nanoseconds = npt.NDArray[np.int64]
-
 
 @dataclass(frozen=True)
 class SimulatedSensor:
@@ -169,7 +165,7 @@ def seconds_since(t0_ns: int, time_ns: Nanoseconds) -> Array:
     return (np.asarray(time_ns, np.int64) - t0_ns) / SECOND_NS
 
 
-def frame_times(sensor: SimulatedSensor) -> tuple[npt.NDArray[np.int64], Nanoseconds]:
+def frame_times(sensor: SimulatedSensor) -> tuple[Integers, Nanoseconds]:
     """Return frame numbers and mid-exposure times [ns] of all frames of the sensor."""
     n = max(int(np.ceil(sensor.duration_s * sensor.rate_hz - sensor.phase - 1e-9)), 0)
     number = np.arange(n, dtype=np.int64)
@@ -220,7 +216,7 @@ class Attitudes:
         return spinning(start[np.zeros(len(t_s), int)], s.axis, s.spin_rate, t_s)
 
 
-def boresight_hidden(r_km: Array, attitude: Rotation) -> npt.NDArray[np.bool_]:
+def boresight_hidden(r_km: Array, attitude: Rotation) -> Flags:
     """Return which boresights meet the Earth."""
     return hidden_by_earth(r_km, attitude.as_matrix()[:, 2], np.inf)
 

@@ -1,12 +1,10 @@
 """Low satellites: constellations as Walker patterns, and a random population in real shells."""
 
 import numpy as np
-import numpy.typing as npt
 
+from epipole.schemas.arrays import Array, Integers
 from epipole.tasks.algorithms.simulation.constants import EARTH_RADIUS_KM
 from epipole.tasks.algorithms.simulation.element_sets import SGP4_EPOCH_JD, utc_julian_date
-
-Array = npt.NDArray[np.float64]
 
 GM_WGS72_KM3_S2 = 398600.8  # of SGP4: Hoots and Roehrich (1980), Spacetrack Report 3
 
@@ -84,7 +82,7 @@ def mean_elements(elements: Array, epoch_ns: int) -> Array:
     return np.stack(np.broadcast_arrays(*columns), axis=1)
 
 
-def nearest_of(r_km: Array, centre: int, n: int) -> npt.NDArray[np.int64]:
+def nearest_of(r_km: Array, centre: int, n: int) -> Integers:
     """Return the rows, in order, of the n positions (m, 3) nearest to one of them."""
     distance = np.linalg.norm(r_km - r_km[centre], axis=1)
     return np.sort(np.argsort(distance, kind="stable")[:n])

@@ -3,12 +3,12 @@
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 from scipy.special import ndtr
 
+from epipole.schemas.arrays import Array, Flags, Indices
 from epipole.tasks.algorithms.simulation.constants import (
     AU_KM,
     DAY_S,
@@ -21,8 +21,6 @@ from epipole.tasks.algorithms.simulation.paths import Paths
 
 # Stars, in zones of declination.
 
-Array = npt.NDArray[np.float64]
-Indices = npt.NDArray[np.int64]
 
 JULIAN_YEAR_S = JULIAN_YEAR_DAYS * DAY_S
 
@@ -137,9 +135,7 @@ def star_directions(
     return u / np.linalg.norm(u, axis=1, keepdims=True)
 
 
-def may_be_detected(
-    u: Array, magnitude: Array, limit: float, apart_rad: float
-) -> npt.NDArray[np.bool_]:
+def may_be_detected(u: Array, magnitude: Array, limit: float, apart_rad: float) -> Flags:
     """Return which stars are bright enough, alone or together with others near them.
 
     Parameters
@@ -187,7 +183,7 @@ def lambert_dimming(u_to_sun: Array, u_to_object: Array) -> Array:
         return -2.5 * np.log10(np.maximum(lit, 0.0))
 
 
-def in_earth_shadow(r_km: Array, u_to_sun: Array) -> npt.NDArray[np.bool_]:
+def in_earth_shadow(r_km: Array, u_to_sun: Array) -> Flags:
     """Return which positions (n, 3) are in the Earth's shadow, taken as a cylinder."""
     along = np.einsum("ij,ij->i", r_km, u_to_sun)
     off2 = np.einsum("ij,ij->i", r_km, r_km) - along * along
@@ -216,7 +212,7 @@ class SimulatedObjects:
 
     paths: Paths
     magnitude: Array  # (n,)
-    is_standard: npt.NDArray[np.bool_]  # (n,) magnitude at 1000 km, else the same everywhere
+    is_standard: Flags  # (n,) magnitude at 1000 km, else the same everywhere
     earth_shadow: bool = False
     phase_law: bool = False
 

@@ -17,8 +17,8 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
+from epipole.schemas.arrays import Array
 from epipole.tasks.algorithms.geometry.boresight import focal_length_from_separations
 from epipole.tasks.algorithms.geometry.camera import Camera, mirrored, pixel_angle, unproject
 from epipole.tasks.algorithms.geometry.optics_calibration import fit_radial
@@ -35,8 +35,6 @@ from epipole.tasks.algorithms.star_identification.frame import (
 from epipole.tasks.algorithms.star_identification.sensor_model import Skies
 from epipole.tasks.algorithms.star_identification.star_grid import Sky, SkyGrid
 from epipole.tasks.algorithms.star_identification.star_pairs import PairTable
-
-Array = npt.NDArray[np.float64]
 
 STEP = 0.01  # of the logarithm of the focal length
 BLOCK = 0.2  # of the logarithm: trials of a block share a sky, whose depth and pairs hardly change

@@ -8,13 +8,10 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
+from epipole.schemas.arrays import Array, Flags, Indices, Integers
 from epipole.tasks.algorithms.kernels import kernel
 from epipole.tasks.algorithms.star_identification.frame import FieldOfView, FrameCentroids, Solution
-
-Array = npt.NDArray[np.float64]
-Rows = npt.NDArray[np.int64]
 
 
 class SensorCentroids(NamedTuple):
@@ -26,13 +23,13 @@ class SensorCentroids(NamedTuple):
     optics, optics_of : the cameras, and (F,) int64, which camera took each frame
     """
 
-    first: Rows
+    first: Indices
     u: Array
     sigma_rad: Array
     instrumental_mag: Array
     beta: Array
     optics: Sequence[FieldOfView]
-    optics_of: Rows
+    optics_of: Indices
 
     def frame(self, k: int) -> FrameCentroids:
         """Return one frame."""
@@ -57,33 +54,33 @@ class RawCentroids(NamedTuple):
     beta, optics, optics_of : as in `SensorCentroids`
     """
 
-    first: Rows
+    first: Indices
     u: Array
     pixel_rad: Array
     sigma_px: Array
     instrumental_mag: Array
     beta: Array
     optics: Sequence[FieldOfView]
-    optics_of: Rows
+    optics_of: Indices
 
     @property
-    def counts(self) -> Rows:
+    def counts(self) -> Indices:
         """(F,) centroids of each frame."""
         return np.diff(self.first)
 
-    def take(self, frames: Rows) -> "RawCentroids":
+    def take(self, frames: Indices) -> "RawCentroids":
         """Return the centroids of these frames."""
         n = self.counts[frames]
         first = np.concatenate([[0], np.cumsum(n)])
         at = np.arange(first[-1]) + np.repeat(self.first[frames] - first[:-1], n)
         return self._rows(first, at, frames)
 
-    def parts(self, parts: Sequence[Rows], frames: Rows) -> "RawCentroids":
+    def parts(self, parts: Sequence[Indices], frames: Indices) -> "RawCentroids":
         """Return parts of frames (rows of centroids) as frames."""
         first = np.concatenate([[0], np.cumsum([len(part) for part in parts])]).astype(np.int64)
         return self._rows(first, np.concatenate([np.zeros(0, np.int64), *parts]), frames)
 
-    def _rows(self, first: Rows, at: Rows, frames: Rows) -> "RawCentroids":
+    def _rows(self, first: Indices, at: Indices, frames: Indices) -> "RawCentroids":
         return RawCentroids(
             first, self.u[at], self.pixel_rad[at], self.sigma_px[at], self.instrumental_mag[at],
             self.beta[frames], self.optics, self.optics_of[frames],
@@ -113,13 +110,13 @@ class Solutions(NamedTuple):
     first : (F + 1,) int64
     """
 
-    solved: npt.NDArray[np.bool_]
+    solved: Flags
     R_sensor_from_icrs: Array
     cov_rad2: Array
-    star: Rows
+    star: Indices
     chi2: Array
     evidence: Array
-    first: Rows
+    first: Indices
 
     def frame(self, k: int) -> Solution | None:
         """Return a frame's solution, None where it is not solved."""
@@ -144,7 +141,7 @@ class Solutions(NamedTuple):
         self.star[at], self.chi2[at] = solution.star, solution.chi2
         self.evidence[k] = solution.evidence
 
-    def enter_all(self, rows: Rows, other: "Solutions", of: Rows) -> None:
+    def enter_all(self, rows: Indices, other: "Solutions", of: Indices) -> None:
         """Write the frames `of` of other solutions, all of them solved, to the frames `rows`."""
         for row, k in zip(rows.tolist(), of.tolist(), strict=True):
             solution = other.frame(k)
@@ -156,7 +153,7 @@ class Solutions(NamedTuple):
         return self._replace(cov_rad2=self.cov_rad2 * scale**2, chi2=self.chi2 / scale**2)
 
 
-def unsolved(first: Rows) -> Solutions:
+def unsolved(first: Indices) -> Solutions:
     """Return the solutions of frames before any is solved."""
     n = len(first) - 1
     return Solutions(
@@ -195,9 +192,7 @@ def brightest_first(first, flux):
 MIN_STATIC_FRAMES, MIN_STATIC_SHARE = 4, 0.3
 
 
-def static_centroids(
-    first: npt.NDArray[np.int64], x_px: Array, y_px: Array
-) -> npt.NDArray[np.bool_]:
+def static_centroids(first: Integers, x_px: Array, y_px: Array) -> Flags:
     """Return which centroids of a sensor's frames are at a pixel where many frames have one.
 
     So are stars if the sensor keeps its direction: the caller decides.
@@ -223,7 +218,7 @@ def static_centroids(
     return stays
 
 
-def _cells(x_px: Array, y_px: Array) -> npt.NDArray[np.int64]:
+def _cells(x_px: Array, y_px: Array) -> Integers:
     """Return a number for each pixel."""
     column, row = (np.clip(np.floor(v), -1e6, 1e6).astype(np.int64) for v in (x_px, y_px))
     return (column + 1_000_000) * 4_000_000 + row + 1_000_000

@@ -19,13 +19,11 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
+from epipole.schemas.arrays import Array
 from epipole.tasks.algorithms.constants import LN_2PI
 from epipole.tasks.algorithms.kernels import borrowing_kernel, kernel
 from epipole.tasks.algorithms.symmetric_matrices import determinant3, invert_symmetric
-
-Array = npt.NDArray[np.float64]
 
 BIN_MAG = 0.25  # of the histogram of magnitudes, of `N_BINS` bins from `FIRST_MAG` on
 FIRST_MAG = -2.0

@@ -7,11 +7,10 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
+from epipole.schemas.arrays import Array, Indices
 from epipole.tasks.algorithms.geometry.attitude import copy_matrix, turn
 from epipole.tasks.algorithms.kernels import borrowing_kernel, inlined_kernel, kernel
-from epipole.tasks.algorithms.star_identification.centroids import Rows
 from epipole.tasks.algorithms.star_identification.search.match_stars import (
     Attitude,
     Centroids,
@@ -21,8 +20,6 @@ from epipole.tasks.algorithms.star_identification.search.match_stars import (
     solve_predicted,
     stars_in_cone,
 )
-
-Array = npt.NDArray[np.float64]
 
 RATE_SIGMA = 1e-3  # [rad/s] of a sensor whose rate is unknown so far; the Earth turns it by 7e-5
 ACCELERATION_SIGMA = 3e-5  # [rad/s^2] how unevenly a sensor turns
@@ -48,8 +45,8 @@ class Memory(NamedTuple):
     t_s: Array
     R: Array
     P: Array
-    counters: Rows
-    near: Rows
+    counters: Indices
+    near: Indices
     cone: Array
 
 
@@ -75,12 +72,12 @@ class FrameArrays(NamedTuple):
     """
 
     t_s: Array
-    first: Rows
+    first: Indices
     u: Array
     sigma: Array
     instrumental: Array
     beta: Array
-    camera: Rows
+    camera: Indices
     box: Array
     half_diagonal: Array
 
@@ -109,7 +106,7 @@ class _FieldScratch(NamedTuple):
     P: Array
     u: Array
     magnitude: Array
-    row: Rows
+    row: Indices
 
 
 @borrowing_kernel

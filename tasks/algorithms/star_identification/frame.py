@@ -11,8 +11,8 @@ from collections.abc import Iterator
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
+from epipole.schemas.arrays import Array, Indices, Integers
 from epipole.tasks.algorithms.geometry.camera import Camera, undistort
 from epipole.tasks.algorithms.kernels import kernel
 from epipole.tasks.algorithms.star_identification.evidence import (
@@ -37,9 +37,6 @@ from epipole.tasks.algorithms.star_identification.search.pair_hypotheses import 
 )
 from epipole.tasks.algorithms.star_identification.star_grid import Sky, SkyGrid
 from epipole.tasks.algorithms.star_identification.star_pairs import PairTable
-
-Array = npt.NDArray[np.float64]
-Rows = npt.NDArray[np.int64]
 
 # Maximum that is taken off the threshold of a search lost in space, by `chance_margin`.
 LOST_MARGIN = 6.0
@@ -111,7 +108,7 @@ class Solution(NamedTuple):
 
     R_sensor_from_icrs: Array
     cov_rad2: Array
-    star: npt.NDArray[np.int64]
+    star: Integers
     chi2: Array
     evidence: float
 
@@ -230,7 +227,7 @@ def identify_predicted(
 
 
 def _least_of_lost(
-    star: npt.NDArray[np.int64], evidence: float, in_view: float, matching: MatchSettings
+    star: Integers, evidence: float, in_view: float, matching: MatchSettings
 ) -> float:
     """Return the minimum log evidence of an attitude with these matches that was searched lost in
     space."""
@@ -270,7 +267,9 @@ def search_lost(
     return verdict._replace(cost_s=cost_s)
 
 
-def _parts(frame: FrameCentroids, at: Rows, matching: MatchSettings) -> Iterator[tuple[Rows, bool]]:
+def _parts(
+    frame: FrameCentroids, at: Indices, matching: MatchSettings
+) -> Iterator[tuple[Indices, bool]]:
     """Yield which centroids are searched, one try after the other, and whether as a crowd."""
     as_crowd = matching.crowded and len(at) > N_PATTERN
     if as_crowd and matching.crowd_first:
@@ -284,7 +283,7 @@ def _parts(frame: FrameCentroids, at: Rows, matching: MatchSettings) -> Iterator
         yield at[:N_CROWDED], True
 
 
-def some_centroids(frame: FrameCentroids, at: npt.NDArray[np.int64]) -> FrameCentroids:
+def some_centroids(frame: FrameCentroids, at: Integers) -> FrameCentroids:
     """Return the frame with these of its centroids."""
     return frame._replace(
         u=frame.u[at], sigma_rad=frame.sigma_rad[at], instrumental_mag=frame.instrumental_mag[at]
@@ -480,7 +479,7 @@ CLUSTER_CELLS = 8  # along each side of the image
 MIN_PER_CELL, TIMES_MEDIAN = 4, 3
 
 
-def without_clusters(u: npt.NDArray[np.float64], box: npt.NDArray[np.float64]) -> Rows:
+def without_clusters(u: Array, box: Array) -> Indices:
     """Return the rows of centroids without most of those in crowded cells of the image.
 
     Parameters

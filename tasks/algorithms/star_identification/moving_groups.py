@@ -19,11 +19,9 @@ import numpy.typing as npt
 from scipy.spatial import KDTree
 from scipy.spatial.distance import cdist
 
+from epipole.schemas.arrays import Array, Flags, Indices
 from epipole.tasks.algorithms.geometry.attitude import optimal_attitude
 from epipole.tasks.algorithms.star_identification.centroids import RawCentroids
-
-Array = npt.NDArray[np.float64]
-Rows = npt.NDArray[np.int64]
 
 # Times between the two frames [s]; sensors that follow satellites turn by 0.01 deg/s against the
 # stars, those that look away from the Earth by 0.06. The later frame may be later by `LATE`.
@@ -40,7 +38,9 @@ MAX_LINKS = 600  # of which it is asked which agree: as many pairs as their squa
 MAX_GROUPS, MAX_SEEDS, ROUNDS = 6, 12, 4  # of two frames; links tried for them; fits of a rotation
 
 
-def moving_groups(centroids: RawCentroids, t_s: Array, rows: Rows) -> tuple[RawCentroids, Rows]:
+def moving_groups(
+    centroids: RawCentroids, t_s: Array, rows: Indices
+) -> tuple[RawCentroids, Indices]:
     """Return groups of centroids that move together, each as a frame, and the frame of each.
 
     Parameters
@@ -70,7 +70,7 @@ def _later_frames(t_s: Array, row: int) -> Iterator[int]:
             yield later
 
 
-def _groups_between(centroids: RawCentroids, row: int, later: int) -> Iterator[Rows]:
+def _groups_between(centroids: RawCentroids, row: int, later: int) -> Iterator[Indices]:
     """Yield the groups of a frame that move to a later one, ascending."""
     one, two = (_brightest(centroids, frame) for frame in (row, later))
     u, v = centroids.u[one], centroids.u[two]
@@ -91,7 +91,7 @@ def _brightest(centroids: RawCentroids, row: int) -> slice:
     return slice(first, min(last, first + BRIGHTEST))
 
 
-def groups_that_move(u: Array, v: Array, reach: float, tolerance: float) -> Iterator[Rows]:
+def groups_that_move(u: Array, v: Array, reach: float, tolerance: float) -> Iterator[Indices]:
     """Yield groups of directions that one rotation each takes from one frame to another.
 
     Parameters
@@ -119,14 +119,16 @@ def groups_that_move(u: Array, v: Array, reach: float, tolerance: float) -> Iter
         yield from _groups_that_agree(u, v, i, k, tolerance)
 
 
-def _densest(points: Array, radius: float) -> npt.NDArray[np.bool_]:
+def _densest(points: Array, radius: float) -> Flags:
     """Return which points lie about the one that has most of them near."""
     tree = KDTree(points)
     middle = np.argmax(tree.query_ball_point(points, radius, return_length=True))
     return np.asarray(np.linalg.norm(points - points[middle], axis=1) < radius)
 
 
-def _groups_that_agree(u: Array, v: Array, i: Rows, k: Rows, tolerance: float) -> Iterator[Rows]:
+def _groups_that_agree(
+    u: Array, v: Array, i: Indices, k: Indices, tolerance: float
+) -> Iterator[Indices]:
     """Yield groups of links (i, k) that agree, as centroids of u."""
     agree = _agreement(u, v, i, k, tolerance)
     free, groups = np.ones(len(i), bool), 0
@@ -145,7 +147,9 @@ def _groups_that_agree(u: Array, v: Array, i: Rows, k: Rows, tolerance: float) -
         free &= ~(np.isin(i, group) | np.isin(k, k[members]))
 
 
-def _agreement(u: Array, v: Array, i: Rows, k: Rows, tolerance: float) -> npt.NDArray[np.float32]:
+def _agreement(
+    u: Array, v: Array, i: Indices, k: Indices, tolerance: float
+) -> npt.NDArray[np.float32]:
     """Return (links, links): 1 where two links agree, else 0."""
     before, after, moved = cdist(u, u)[np.ix_(i, i)], cdist(v, v)[np.ix_(k, k)], v[k] - u[i]
     agree = (np.abs(after - before) < tolerance) & (before > 2 * tolerance)
@@ -156,10 +160,10 @@ def _agreement(u: Array, v: Array, i: Rows, k: Rows, tolerance: float) -> npt.ND
 def _taken_along(
     u: Array,
     v: Array,
-    free: npt.NDArray[np.bool_],
-    members: npt.NDArray[np.bool_],
+    free: Flags,
+    members: Flags,
     tolerance: float,
-) -> npt.NDArray[np.bool_]:
+) -> Flags:
     """Return which free links the rotation of the members takes along, fitted some times."""
     for _ in range(ROUNDS):
         equal = np.ones(members.sum())

@@ -13,8 +13,8 @@
 """
 
 import numpy as np
-import numpy.typing as npt
 
+from epipole.schemas.arrays import Array, Integers
 from epipole.tasks.algorithms.star_identification.centroids import SensorCentroids, Solutions
 from epipole.tasks.algorithms.star_identification.frame import (
     FrameCentroids,
@@ -37,8 +37,6 @@ from epipole.tasks.algorithms.star_identification.sequence import (
     identify_sample,
 )
 from epipole.tasks.algorithms.star_identification.star_grid import Sky
-
-Array = npt.NDArray[np.float64]
 
 # Another brightness of the same stars.
 
@@ -86,7 +84,7 @@ RESCALINGS, MIN_DOF = 3, 5
 PATIENCE, MAX_BACKOFF_LOG2 = 4, 10
 
 
-def poor_frames(solutions: Solutions) -> npt.NDArray[np.int64]:
+def poor_frames(solutions: Solutions) -> Integers:
     """Return the identified frames of which far fewer centroids are stars than is usual."""
     counts = np.diff(solutions.first)
     frame = np.repeat(np.arange(len(counts)), counts)

@@ -8,9 +8,8 @@ no search can identify do not spend what later ones need.
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
-Rows = npt.NDArray[np.int64]
+from epipole.schemas.arrays import Indices
 
 # What all searches of one frame may cost, as part of the setting `identification.time_limit_s`; the
 # rest is left to all else. A sensor's searches may cost a tenth of that per frame: 42 ms with the
@@ -35,7 +34,7 @@ class SearchBudget:
         self.spent_s = 0.0
         self.frame_s = np.zeros(n_frames)
 
-    def allow(self, rows: Rows, share: float, one_will_do: bool = False) -> "Allowance":
+    def allow(self, rows: Indices, share: float, one_will_do: bool = False) -> "Allowance":
         """Return what a pass over these frames may cost: a share of what is left."""
         size_s = share * (self.total_s - self.spent_s)
         return Allowance(self, rows, self.spent_s, size_s, 1.0 if one_will_do else HEAD_START)
@@ -51,7 +50,7 @@ class Allowance(NamedTuple):
     """
 
     budget: SearchBudget
-    rows: Rows
+    rows: Indices
     start_s: float
     size_s: float
     head_start: float

@@ -23,8 +23,8 @@ from collections.abc import Iterator
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
+from epipole.schemas.arrays import Array, Indices
 from epipole.tasks.algorithms.star_identification.centroids import RawCentroids, Solutions
 from epipole.tasks.algorithms.star_identification.frame import MatchSettings, Solution
 from epipole.tasks.algorithms.star_identification.moving_groups import moving_groups
@@ -54,8 +54,6 @@ from epipole.tasks.algorithms.star_identification.sequence import (
 )
 from epipole.tasks.algorithms.star_identification.star_grid import Sky
 
-Array = npt.NDArray[np.float64]
-Rows = npt.NDArray[np.int64]
 Statuses = list[str | None]
 
 MIN_CENTROIDS = 4  # of a frame that takes part in the probe and the sample
@@ -112,9 +110,9 @@ class _Probe(NamedTuple):
     usable : (m,) int64, all frames with enough centroids
     """
 
-    rows: Rows
+    rows: Indices
     solutions: list[Solution | None]
-    usable: Rows
+    usable: Indices
 
     @property
     def failed(self) -> bool:
@@ -232,7 +230,7 @@ def _assumed_limit(centroids: RawCentroids, typical: float, crowded: bool, skies
 
 
 def _anchored_by_motion(
-    frames: FrameSample, rows: Rows, skies: Skies, model: SensorModel, scales: tuple[float, ...]
+    frames: FrameSample, rows: Indices, skies: Skies, model: SensorModel, scales: tuple[float, ...]
 ) -> FrameSample:
     """Return the frames with solutions of these rows' moving groups as priors; the same frames
     where no group is of stars."""
@@ -250,7 +248,7 @@ def _anchored_by_motion(
     return frames.anchored(of_frame, solutions) if any(solutions) else frames
 
 
-def aperiodic_rows(n: int, wanted: int) -> Rows:
+def aperiodic_rows(n: int, wanted: int) -> Indices:
     """Return `wanted` of n rows, spread without a period: every third frame may show the Earth.
 
     They are multiples of the golden ratio, modulo 1.
@@ -368,7 +366,7 @@ def _learn_around(
     return frames.anchored(near, sampled) if any(sampled) else anchored, model
 
 
-def _runs_around(n: int, rows: Rows) -> Rows:
+def _runs_around(n: int, rows: Indices) -> Indices:
     """Return about `SAMPLED` of n rows in runs around these: they are followed, not searched."""
     length = min(-(-SAMPLED // len(rows)), n)
     start = np.clip(rows - length // 2, 0, n - length)

@@ -8,10 +8,10 @@ errors), the zero point of its brightness, and its faintest star; `learn` puts t
 from typing import NamedTuple, Protocol
 
 import numpy as np
-import numpy.typing as npt
 from scipy.optimize import brentq
 from scipy.special import polygamma, psi
 
+from epipole.schemas.arrays import Array, Integers
 from epipole.tasks.algorithms.star_identification.centroids import RawCentroids
 from epipole.tasks.algorithms.star_identification.frame import (
     FieldOfView,
@@ -22,8 +22,6 @@ from epipole.tasks.algorithms.star_identification.frame import (
 )
 from epipole.tasks.algorithms.star_identification.star_grid import Sky, SkyGrid
 from epipole.tasks.algorithms.star_identification.star_pairs import PairTable
-
-Array = npt.NDArray[np.float64]
 
 USELESS_SCATTER_MAG = 1.0  # flux that scatters more about the catalogue is not used
 MIN_SCATTER_MAG = 0.15  # assumed of brightness: a sample may scatter less than all frames
@@ -98,7 +96,7 @@ def residual_scale(solutions: list[Solution | None]) -> Scale:
     return scale_of(star, chi2, len(solved))
 
 
-def scale_of(star: npt.NDArray[np.int64], chi2: Array, n_solved: int) -> Scale:
+def scale_of(star: Integers, chi2: Array, n_solved: int) -> Scale:
     """Return the rms per axis of normalised residuals of n_solved frames.
 
     star, chi2 : (N,), (N,), each centroid's star (-1 none) and squared distance over sigma squared
@@ -300,7 +298,7 @@ def _learned_limit(
     return faintest_star(frames, deeper, deep, model.matching.gate_sigma, start)
 
 
-def evenly_spaced(n: int, wanted: int) -> npt.NDArray[np.int64]:
+def evenly_spaced(n: int, wanted: int) -> Integers:
     """Return `wanted` of n rows, evenly spaced; all where there are fewer."""
     return np.unique(np.linspace(0, max(n - 1, 0), wanted).astype(np.int64))[:n]
 
@@ -320,7 +318,7 @@ MIN_SCALE = 0.02  # lowest error of a frame over the sensor's: residuals may be 
 MAX_PRIOR_DOF = 200.0
 
 
-def frame_scales(square_sum: Array, dof: npt.NDArray[np.int64]) -> Array:
+def frame_scales(square_sum: Array, dof: Integers) -> Array:
     """Return each frame's rms of residuals per axis; one for all where frames do not differ.
 
     Parameters

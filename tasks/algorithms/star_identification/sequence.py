@@ -12,6 +12,7 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from epipole.schemas.arrays import Array, Integers
 from epipole.tasks.algorithms.star_identification.centroids import (
     RawCentroids,
     SensorCentroids,
@@ -47,8 +48,6 @@ from epipole.tasks.algorithms.star_identification.search_budget import (
 from epipole.tasks.algorithms.star_identification.sensor_model import SensorModel, Skies
 from epipole.tasks.algorithms.star_identification.star_grid import Sky, SkyGrid
 from epipole.tasks.algorithms.star_identification.star_pairs import PairTable
-
-Array = npt.NDArray[np.float64]
 
 # Where searches keep failing: after PATIENCE of them, back off exponentially to at most
 # max(MAX_SKIPPED, n SKIPPED_SHARE) skipped frames of the n since the last success. The backward
@@ -108,9 +107,9 @@ class FrameSample(NamedTuple):
     priors: Priors
     anchors: bool = False
     budget: SearchBudget | None = None
-    rows: npt.NDArray[np.int64] | None = None
+    rows: Integers | None = None
 
-    def take(self, rows: npt.NDArray[np.int64]) -> "FrameSample":
+    def take(self, rows: Integers) -> "FrameSample":
         """Return the frames of these rows."""
         priors = Priors(self.priors.R_sensor_from_icrs[rows], self.priors.sigma_rad[rows])
         of_sensor = None if self.rows is None else self.rows[rows]
@@ -128,9 +127,7 @@ class FrameSample(NamedTuple):
         """Return the centroids with the errors of the sensor's model."""
         return self.centroids.frames(model.scale, model.use_flux)
 
-    def anchored(
-        self, rows: npt.NDArray[np.int64], solutions: list[Solution | None]
-    ) -> "FrameSample":
+    def anchored(self, rows: Integers, solutions: list[Solution | None]) -> "FrameSample":
         """Return the frames with these solutions as priors, where the log gives none."""
         R, sigma = self.priors.R_sensor_from_icrs.copy(), self.priors.sigma_rad.copy()
         for row, solution in zip(rows, solutions, strict=True):

@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from epipole.schemas.arrays import Array
 from epipole.tasks.algorithms.kernels import borrowing_kernel, kernel
 from epipole.tasks.algorithms.star_catalogue import NavigationCatalogue
 from epipole.tasks.algorithms.star_identification.evidence import log_magnitude_density
@@ -34,7 +35,7 @@ class SkyGrid(NamedTuple):
     radius_rad: float
 
 
-def build_sky_grid(u_icrs: npt.NDArray[np.float64], radius_rad: float) -> SkyGrid:
+def build_sky_grid(u_icrs: Array, radius_rad: float) -> SkyGrid:
     """Return the grid of (n, 3) star directions for look-ups within `radius_rad`."""
     # Cells of two disc radii: a star is in about four. At most 256 along an edge keep the grid of a
     # small radius in the processor's cache.
@@ -119,7 +120,7 @@ class StarBands(NamedTuple):
 
     first: npt.NDArray[np.int32]
     row: npt.NDArray[np.int32]
-    u: npt.NDArray[np.float64]
+    u: Array
 
 
 class ConeCells(NamedTuple):
@@ -207,7 +208,7 @@ class Sky(NamedTuple):
     """
 
     catalogue: NavigationCatalogue
-    log_density: npt.NDArray[np.float64]
+    log_density: Array
     rho: float
     bands: StarBands
 
@@ -226,7 +227,7 @@ def pattern_size(sky: Sky, solid_angle_sr: float) -> int:
     return min(int(PATTERN_STARS * 4 * np.pi / solid_angle_sr), len(sky.catalogue.star_id))
 
 
-def pattern_pairs(u_icrs: npt.NDArray[np.float64], diagonal_rad: float) -> PairTable:
+def pattern_pairs(u_icrs: Array, diagonal_rad: float) -> PairTable:
     """Return the pairs of these (n, 3) stars that fit into a field with this diagonal."""
     # Neighbours a star has within r: (n / 4 pi) pi r^2; each pair counts twice.
     reach = min(diagonal_rad, np.sqrt(8.0 * MAX_PAIRS) / max(len(u_icrs), 1), np.pi)

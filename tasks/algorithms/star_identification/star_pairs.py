@@ -10,9 +10,8 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial import cKDTree
 
+from epipole.schemas.arrays import Array, Integers
 from epipole.tasks.algorithms.kernels import borrowing_kernel
-
-Array = npt.NDArray[np.float64]
 
 TURN = 1 << 16  # a full turn in units of a stored position angle: differences wrap by themselves
 # The reach of `NearStars` over the longest separation. A square field's stars lie within this of a
@@ -109,9 +108,9 @@ class NearStars(NamedTuple):
     reach : float, the longest of these chords
     """
 
-    first: npt.NDArray[np.int64]
+    first: Integers
     other: npt.NDArray[np.int32]
-    chord: npt.NDArray[np.float64]
+    chord: Array
     turn: npt.NDArray[np.uint16]
     reach: float
 
@@ -137,7 +136,7 @@ class PairTable(NamedTuple):
     near: NearStars
 
 
-def build_pair_table(u_icrs: npt.NDArray[np.float64], max_separation_rad: float) -> PairTable:
+def build_pair_table(u_icrs: Array, max_separation_rad: float) -> PairTable:
     """Return all pairs of (n, 3) stars, brightest first, within `max_separation_rad`."""
     reach = 2.0 * np.sin(min(max_separation_rad, np.pi) / 2)
     pairs = cKDTree(u_icrs).query_pairs(reach, output_type="ndarray").astype(np.int32)
@@ -155,7 +154,7 @@ def build_pair_table(u_icrs: npt.NDArray[np.float64], max_separation_rad: float)
 def _near_stars(
     a: npt.NDArray[np.int32],
     b: npt.NDArray[np.int32],
-    chord: npt.NDArray[np.float64],
+    chord: Array,
     at_a: npt.NDArray[np.uint16],
     at_b: npt.NDArray[np.uint16],
     n_stars: int,
@@ -175,8 +174,8 @@ def _near_stars(
 
 
 def tangent_axes(
-    u: npt.NDArray[np.float64],
-) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
+    u: Array,
+) -> tuple[Array, Array]:
     """Return two (n, 3) unit vectors that complete each direction to a right-handed frame."""
     # Any two will do. The axis crossed with the direction is never parallel to it.
     near_z = np.abs(u[:, 2:]) > 0.9
@@ -185,9 +184,7 @@ def tangent_axes(
     return along, np.cross(u, along)
 
 
-def position_angle(
-    along: npt.NDArray[np.float64], across: npt.NDArray[np.float64], other: npt.NDArray[np.float64]
-) -> npt.NDArray[np.uint16]:
+def position_angle(along: Array, across: Array, other: Array) -> npt.NDArray[np.uint16]:
     """Return the angle of the (n, 3) others about the directions with these axes, in `TURN`."""
     angle = np.arctan2(np.einsum("ni,ni->n", across, other), np.einsum("ni,ni->n", along, other))
     return (np.floor(angle * (TURN / (2 * np.pi))).astype(np.int64) % TURN).astype(np.uint16)

@@ -13,8 +13,8 @@ adds its scatter to the errors.
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
+from epipole.schemas.arrays import Array, Indices
 from epipole.tasks.algorithms.kernels import kernel
 from epipole.tasks.algorithms.symmetric_matrices import factor, solve_factored
 from epipole.tasks.algorithms.tracking.local_motion import detections_about
@@ -26,9 +26,6 @@ from epipole.tasks.algorithms.tracking.sky_filter import (
     approach,
     jerk,
 )
-
-Array = npt.NDArray[np.float64]
-Indices = npt.NDArray[np.int64]
 
 ORDER = 5  # of the polynomial
 N_ROWS = 2 * (ORDER + 1)

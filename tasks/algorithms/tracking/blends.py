@@ -11,14 +11,11 @@ from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
+from epipole.schemas.arrays import Array, Flags, Indices
 from epipole.tasks.algorithms.kernels import kernel
 from epipole.tasks.algorithms.tracking.local_motion import directions_at
 from epipole.tasks.algorithms.tracking.sky_filter import BEND_SHARE, acceleration
-
-Array = npt.NDArray[np.float64]
-Indices = npt.NDArray[np.int64]
 
 BLEND_PX = 2.5  # separation below which two images blend, if there are too few pairs to measure it
 # How that separation is measured: width of the bins, share of the expected pairs below which images
@@ -104,7 +101,7 @@ def blend_variance(tracked: TrackedDetections, frame_s: Array, pixel_rad: float)
     return out
 
 
-def of_neighbour(tracked: TrackedDetections, variance: Array) -> npt.NDArray[np.bool_]:
+def of_neighbour(tracked: TrackedDetections, variance: Array) -> Flags:
     """Return which detections are too faint to hold their tracklet's object, (n,).
 
     A blend is brighter than either object. Detections that may be blends by their `variance` (n,),
@@ -152,7 +149,7 @@ def _ends_of(tracked: TrackedDetections) -> _TrackletEnds:
     )
 
 
-def _usual_flux(tracked: TrackedDetections, blended: npt.NDArray[np.bool_]) -> Array:
+def _usual_flux(tracked: TrackedDetections, blended: Flags) -> Array:
     """Return the median flux of each tracklet's unblended detections; NaN if unknown."""
     out = np.full(len(tracked.bounds) - 1, np.nan)
     known = ~blended & np.isfinite(tracked.flux)

@@ -9,12 +9,9 @@ a frame that moves with them, they hardly move, and which detection belongs to w
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
+from epipole.schemas.arrays import Array, Flags, Indices
 from epipole.tasks.algorithms.tracking.sky_filter import acceleration
-
-Array = npt.NDArray[np.float64]
-Indices = npt.NDArray[np.int64]
 
 MIN_TRACKS = 4  # minimum number of tracks that show the common acceleration of a frame
 MIN_SHOWN = 0.5  # minimum share of the frames in which it is shown
@@ -103,7 +100,7 @@ def _robust_mean(values: Array, u: Array) -> tuple[Array, float]:
     return mean, float(np.median(distance))
 
 
-def _smoothed(time_s: Array, values: Array, good: npt.NDArray[np.bool_]) -> Array:
+def _smoothed(time_s: Array, values: Array, good: Flags) -> Array:
     """Return values (f, 3) smoothed by lines through those around each time; gaps are filled.
 
     Twice: errors of successive second differences then nearly cancel, so that the frame of

@@ -14,16 +14,12 @@ object keeps its light at one position too:
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 from scipy.special import logsumexp
 
+from epipole.schemas.arrays import Array, Flags, Indices
 from epipole.tasks.algorithms.geometry.camera import Camera, unproject
 from epipole.tasks.algorithms.geometry.directions import matrix_from_quaternion
 from epipole.tasks.algorithms.tracking.sky_filter import acceleration
-
-Array = npt.NDArray[np.float64]
-Indices = npt.NDArray[np.int64]
-Flags = npt.NDArray[np.bool_]
 
 # Half and double of these were tried on the scenes of the tests. No scene depends on `OFF_MIDDLE`,
 # `MIDDLE_PX`, `CENTRE`, `JEFFREYS`, `MIN_FRAMES`, `MIN_STILL`, `CERTAIN` or `MOTION_BOUND`: they

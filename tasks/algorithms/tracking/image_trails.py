@@ -7,9 +7,8 @@ scatter of a sensor's detections about smooth motions shows it, beyond that othe
 """
 
 import numpy as np
-import numpy.typing as npt
 
-Array = npt.NDArray[np.float64]
+from epipole.schemas.arrays import Array
 
 # Least number of residuals, and the largest weight of a detection in the fitted motion.
 MIN_RESIDUALS, MAX_LEVERAGE = 50, 0.8

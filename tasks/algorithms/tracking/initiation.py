@@ -16,8 +16,8 @@ cannot reach enough are skipped. In dense frames these are most pairs; no track 
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
+from epipole.schemas.arrays import Array, Indices
 from epipole.tasks.algorithms.kernels import kernel
 from epipole.tasks.algorithms.tracking.sky_filter import (
     SIZE,
@@ -31,9 +31,6 @@ from epipole.tasks.algorithms.tracking.sky_filter import (
     shrink,
     window,
 )
-
-Array = npt.NDArray[np.float64]
-Indices = npt.NDArray[np.int64]
 
 NONE = -1
 P_DETECTION = 0.9  # probability that an object in the field is detected in a frame

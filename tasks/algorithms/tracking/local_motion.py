@@ -8,13 +8,11 @@ propagate exactly, both independent ones and one that all share.
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
+from epipole.schemas.arrays import Array, Integers
 from epipole.tasks.algorithms.kernels import kernel
 from epipole.tasks.algorithms.symmetric_matrices import invert_symmetric
 from epipole.tasks.algorithms.tracking.sky_filter import BEND_SHARE, acceleration, jerk
-
-Array = npt.NDArray[np.float64]
 
 BIAS_SHARE = 0.25  # maximum error by the neglected third derivative, in sigmas of a detection
 
@@ -22,8 +20,8 @@ BIAS_SHARE = 0.25  # maximum error by the neglected third derivative, in sigmas 
 class _Queries(NamedTuple):
     """The arguments of `directions_at` that say which directions are computed."""
 
-    first: npt.NDArray[np.int64]
-    last: npt.NDArray[np.int64]
+    first: Integers
+    last: Integers
     at: Array
     unknown_rate: float
     max_half: float
@@ -47,7 +45,7 @@ class _MotionFits(NamedTuple):
     w: Array
     noise: Array
     bias: Array
-    fitted: npt.NDArray[np.int64]
+    fitted: Integers
     moments: Array
     unmodelled: Array
 
@@ -74,7 +72,7 @@ class LocalMotion(NamedTuple):
     w: Array
     cov_noise: Array
     cov_bias: Array
-    fitted: npt.NDArray[np.int64]
+    fitted: Integers
     moments: Array
     unmodelled: Array
 
@@ -244,8 +242,8 @@ def _evaluate(queries, detections, fits):
 
 
 def directions_at(
-    first: npt.NDArray[np.int64],
-    last: npt.NDArray[np.int64],
+    first: Integers,
+    last: Integers,
     at_s: Array,
     unknown_rate_rad_s: float,
     time_s: Array,

@@ -18,8 +18,8 @@ of a short sequence are followed once more, with a lower limit of evidence.
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
+from epipole.schemas.arrays import Array, Integers
 from epipole.tasks.algorithms.kernels import kernel
 from epipole.tasks.algorithms.tracking.common_motion import CommonMotion, common_motion
 from epipole.tasks.algorithms.tracking.initiation import (
@@ -45,8 +45,6 @@ from epipole.tasks.algorithms.tracking.sky_filter import (
     rate_of,
     window,
 )
-
-Array = npt.NDArray[np.float64]
 
 SLACK_FRAMES = 4  # a track begins within this many frames beyond the minimum of detections
 # Limit of pairs in a sequence, and the minimum of that limit per frame. In denser clutter, the
@@ -78,13 +76,13 @@ class _Tracks(NamedTuple):
     bend: Array
     P: Array
     at: Array
-    missed: npt.NDArray[np.int64]
+    missed: Integers
     strays: Array
 
 
 def follow_detections(
     time_s: Array,
-    offsets: npt.NDArray[np.int64],
+    offsets: Integers,
     u_icrs: Array,
     sigma_rad: Array,
     *,
@@ -96,7 +94,7 @@ def follow_detections(
     field_sr: float,
     false_alarm: float,
     false_alarm_sequence: float = FALSE_ALARM_SEQUENCE,
-) -> npt.NDArray[np.int64]:
+) -> Integers:
     """Return the track number of every detection, -1 without a track.
 
     Parameters
@@ -160,19 +158,19 @@ def follow_detections(
     return _follow_free(*detections, track, rule._replace(min_evidence=-float(np.log(per_frame))))
 
 
-def _explained(track: npt.NDArray[np.int64], min_detections: int) -> int:
+def _explained(track: Integers, min_detections: int) -> int:
     """Return how many detections the tracks hold beyond the least that each must have."""
     return int(np.count_nonzero(track != NONE)) - min_detections * (int(track.max(initial=-1)) + 1)
 
 
 def _follow_in_motion(
     time_s: Array,
-    offsets: npt.NDArray[np.int64],
+    offsets: Integers,
     u_icrs: Array,
     sigma_rad: Array,
     rule: TrackRule,
     motion: CommonMotion,
-) -> npt.NDArray[np.int64]:
+) -> Integers:
     """Return the track number of every detection that moves as the common motion says."""
     frame = np.repeat(np.arange(len(time_s)), np.diff(offsets))
     return _follow_by_rule(
@@ -189,12 +187,12 @@ def _follow_in_motion(
 
 def _follow_free(
     time_s: Array,
-    offsets: npt.NDArray[np.int64],
+    offsets: Integers,
     u_icrs: Array,
     sigma_rad: Array,
-    track: npt.NDArray[np.int64],
+    track: Integers,
     rule: TrackRule,
-) -> npt.NDArray[np.int64]:
+) -> Integers:
     """Return the tracks with those of the detections that have none; these come last."""
     free = np.flatnonzero(track == NONE)
     if not len(free):
@@ -209,11 +207,11 @@ def _follow_free(
 
 def _follow_by_rule(
     time_s: Array,
-    offsets: npt.NDArray[np.int64],
+    offsets: Integers,
     u_icrs: Array,
     sigma_rad: Array,
     rule: TrackRule,
-) -> npt.NDArray[np.int64]:
+) -> Integers:
     """Return the track number of every detection, by one rule."""
     n_in = np.diff(offsets)
     detections = Detections(

@@ -10,10 +10,9 @@ they scatter more along their motion than their sigmas say.
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 from numpy.polynomial.chebyshev import chebder, chebval, chebvander
 
-Array = npt.NDArray[np.float64]
+from epipole.schemas.arrays import Array
 
 # Errors that are tried [s]: from what moves an object of 10 deg/s by half a second of arc, to half
 # of an exposure of 0.1 s.

@@ -13,16 +13,13 @@ where they share a cell, so the cost grows with the sensors per cell, not with a
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
+from epipole.schemas.arrays import Array, Indices
 from epipole.tasks.algorithms.association.odds import NEAR_SIGMA, near_fields, next_mark
 from epipole.tasks.algorithms.association.search.sight_lines import BEYOND
 from epipole.tasks.algorithms.association.views import HALF, PLANE, REACH, TURN, direction
 from epipole.tasks.algorithms.constants import EARTH_RADIUS_KM
 from epipole.tasks.algorithms.kernels import borrowing_kernel, kernel
-
-Array = npt.NDArray[np.float64]
-Indices = npt.NDArray[np.int64]
 
 FEW_SENSORS = 32  # up to this number of sensors, a single cell holds all of them
 MIN_CELL = 0.05  # size of a cell at the Earth's surface, over the Earth's radius

@@ -14,8 +14,8 @@ For each seed, `grow_all` goes through these steps (2 to 5 are `_grow`):
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
+from epipole.schemas.arrays import Array, Flags, Indices
 from epipole.tasks.algorithms.association.odds import (
     near_fields,
     nearest_range2,
@@ -29,10 +29,6 @@ from epipole.tasks.algorithms.association.search.instant_points import join, pos
 from epipole.tasks.algorithms.association.search.sight_lines import quantile
 from epipole.tasks.algorithms.association.views import error_sr, residual, residual_chi2
 from epipole.tasks.algorithms.kernels import borrowing_kernel, inlined_kernel, kernel
-
-Array = npt.NDArray[np.float64]
-Indices = npt.NDArray[np.int64]
-Flags = npt.NDArray[np.bool_]
 
 # A seed is given up if the log-odds of the other sensors are below the first, and the second number
 # of them at least has its points in the field. With one sensor, or -2, small scenes of

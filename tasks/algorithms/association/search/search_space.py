@@ -7,16 +7,12 @@
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
+from epipole.schemas.arrays import Array, Flags, Indices
 from epipole.tasks.algorithms.association.chance import Chance
 from epipole.tasks.algorithms.association.samples import InstantPoints
 from epipole.tasks.algorithms.association.search.field_index import FieldIndex
 from epipole.tasks.algorithms.association.views import Views
-
-Array = npt.NDArray[np.float64]
-Indices = npt.NDArray[np.int64]
-Flags = npt.NDArray[np.bool_]
 
 RESIDUAL_PARTS = 14  # of `views.residual`, and the right-hand side of `instant_points`
 PREDICTED_COLUMNS = 10  # of `candidates`

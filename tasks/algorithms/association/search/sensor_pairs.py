@@ -9,8 +9,8 @@
 """
 
 import numpy as np
-import numpy.typing as npt
 
+from epipole.schemas.arrays import Array, Flags, Indices
 from epipole.tasks.algorithms.association.search.field_index import (
     AXIS,
     FEW_SENSORS,
@@ -32,10 +32,6 @@ from epipole.tasks.algorithms.association.views import (
 )
 from epipole.tasks.algorithms.constants import EARTH_RADIUS_KM
 from epipole.tasks.algorithms.kernels import borrowing_kernel, kernel
-
-Array = npt.NDArray[np.float64]
-Indices = npt.NDArray[np.int64]
-Flags = npt.NDArray[np.bool_]
 
 NEAREST_STEP_KM, N_STEPS = 20.0, 64  # along a field, to test whether it meets another one
 MAX_TESTED_INSTANTS = 8  # of the instants at which both sensors have tracklets
@@ -71,7 +67,7 @@ def meeting_pairs(index: FieldIndex, cones: Array, farthest_km: float) -> tuple[
     return key // n, key % n
 
 
-def fields_meet(cones: Array, a: Indices, b: Indices, farthest_km: float) -> npt.NDArray[np.bool_]:
+def fields_meet(cones: Array, a: Indices, b: Indices, farthest_km: float) -> Flags:
     """Return whether the fields of two sensors overlap anywhere, (n,) bool.
 
     At some of the instants at which both have tracklets, the axis of sensor a's cone is followed in

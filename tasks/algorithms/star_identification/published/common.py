@@ -9,8 +9,8 @@ frame is followed, no prior is used.
 from collections.abc import Callable
 
 import numpy as np
-import numpy.typing as npt
 
+from epipole.schemas.arrays import Array, Flags, Indices, Integers
 from epipole.tasks.algorithms.geometry.attitude import optimal_attitude
 from epipole.tasks.algorithms.star_identification.centroids import RawCentroids, unsolved
 from epipole.tasks.algorithms.star_identification.frame import (
@@ -25,9 +25,6 @@ from epipole.tasks.algorithms.star_identification.sensor import IdentifiedSensor
 from epipole.tasks.algorithms.star_identification.sensor_model import Skies, scale_of
 from epipole.tasks.algorithms.star_identification.star_grid import Sky
 
-Array = npt.NDArray[np.float64]
-Rows = npt.NDArray[np.int64]
-
 
 def chords(u: Array) -> Array:
     """Return (n, n) chords 2 sin(separation / 2) between (n, 3) unit vectors."""
@@ -35,8 +32,8 @@ def chords(u: Array) -> Array:
 
 
 def agreeing_candidates(
-    u: Array, sigma_rad: Array, star_u: Array, centroid: Rows, star: Rows, gate_sigma: float
-) -> Rows:
+    u: Array, sigma_rad: Array, star_u: Array, centroid: Indices, star: Indices, gate_sigma: float
+) -> Indices:
     """Return the largest set of candidate matches around one that agree with each other.
 
     Candidate k says that centroid[k] is star[k]. Its support is the number of centroids with a
@@ -82,8 +79,8 @@ def agreeing_candidates(
 
 
 def _agree(
-    u: Array, sigma_rad: Array, star_u: Array, centroid: Rows, star: Rows, gate_sigma: float
-) -> npt.NDArray[np.bool_]:
+    u: Array, sigma_rad: Array, star_u: Array, centroid: Indices, star: Indices, gate_sigma: float
+) -> Flags:
     measured, listed = chords(u)[np.ix_(centroid, centroid)], chords(star_u[star])
     variance = sigma_rad[centroid] ** 2
     tolerance = gate_sigma * np.sqrt(variance[:, None] + variance) + MAX_BETA * measured
@@ -91,7 +88,7 @@ def _agree(
     return other & (np.abs(measured - listed) < tolerance)
 
 
-def _support(agree: npt.NDArray[np.bool_], centroid: Rows, n: int) -> npt.NDArray[np.int64]:
+def _support(agree: Flags, centroid: Indices, n: int) -> Integers:
     """Return how many centroids have a candidate that agrees with each candidate."""
     of = np.zeros((len(centroid), n), np.float32)
     of[np.arange(len(centroid)), centroid] = 1.0
@@ -111,13 +108,13 @@ def _same_hand(u: Array, s: Array) -> bool:
 
 # Takes (n, 3) directions, brightest first, and (n,) sigmas [rad]; returns (n,) rows of the sky's
 # catalogue, -1 where a centroid is not identified.
-Matcher = Callable[[Array, Array], Rows]
+Matcher = Callable[[Array, Array], Indices]
 
 ASSUMED_SIGMA_PX = 0.5  # of centroids without sigma; the published maps have it
 
 
 def solve_matches(
-    frame: FrameCentroids, sky: Sky, star: npt.NDArray[np.int64], gate_sigma: float
+    frame: FrameCentroids, sky: Sky, star: Integers, gate_sigma: float
 ) -> Solution | None:
     """Return the attitude of a frame's matches; None where fewer than three agree with it."""
     star = star.copy()

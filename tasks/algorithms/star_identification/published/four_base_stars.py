@@ -14,8 +14,8 @@ matches counts. A tie identifies nothing.
 import math
 
 import numpy as np
-import numpy.typing as npt
 
+from epipole.schemas.arrays import Array, Integers
 from epipole.tasks.algorithms.kernels import kernel
 from epipole.tasks.algorithms.star_identification.centroids import RawCentroids
 from epipole.tasks.algorithms.star_identification.frame import FieldOfView, MatchSettings
@@ -29,8 +29,6 @@ from epipole.tasks.algorithms.star_identification.sequence import Priors
 from epipole.tasks.algorithms.star_identification.star_grid import Sky, pattern_pairs
 from epipole.tasks.algorithms.star_identification.star_pairs import PairTable, range_of
 
-Array = npt.NDArray[np.float64]
-
 N_BASE = 8  # brightest centroids of which four are tried at a time
 PAIR_GATE = 3.0  # sigma; of a separation
 # The published limit of 1e-6 rad^2 at 0.5 px of 20.3 degrees / 1024, in units of sigma^2.
@@ -38,9 +36,7 @@ DISSIMILARITY_SIGMA2 = 33.0
 MAX_IDENTITIES = 64  # four centroids with more are skipped
 
 
-def match_four_base_stars(
-    u: Array, sigma_rad: Array, star_u: Array, pairs: PairTable
-) -> npt.NDArray[np.int64]:
+def match_four_base_stars(u: Array, sigma_rad: Array, star_u: Array, pairs: PairTable) -> Integers:
     """Return the star of each centroid, by the method of four base stars.
 
     Parameters

@@ -14,8 +14,8 @@ computed from them.
 import math
 
 import numpy as np
-import numpy.typing as npt
 
+from epipole.schemas.arrays import Array, Integers
 from epipole.tasks.algorithms.kernels import kernel
 from epipole.tasks.algorithms.star_identification.centroids import RawCentroids
 from epipole.tasks.algorithms.star_identification.frame import FieldOfView, MatchSettings
@@ -30,17 +30,13 @@ from epipole.tasks.algorithms.star_identification.sequence import Priors
 from epipole.tasks.algorithms.star_identification.star_grid import Sky, pattern_pairs
 from epipole.tasks.algorithms.star_identification.star_pairs import PairTable, range_of
 
-Array = npt.NDArray[np.float64]
-
 BIN_RAD = math.radians(0.01)
 PAIR_GATE = 2.5  # sigma; of a separation
 N_NEIGHBOURS = 24  # nearest centroids whose separations from the main star are looked up
 N_CENTROIDS = 48  # brightest centroids that are used
 
 
-def match_group(
-    u: Array, sigma_rad: Array, star_u: Array, pairs: PairTable
-) -> npt.NDArray[np.int64]:
+def match_group(u: Array, sigma_rad: Array, star_u: Array, pairs: PairTable) -> Integers:
     """Return the star of each centroid, by the improved match group.
 
     Parameters and result as `four_base_stars.match_four_base_stars`.
@@ -50,7 +46,7 @@ def match_group(
     return agreeing_candidates(u, sigma_rad, star_u, centroid, single[centroid], PAIR_GATE)
 
 
-def states(u: Array, sigma_rad: Array, star_u: Array, pairs: PairTable) -> npt.NDArray[np.int64]:
+def states(u: Array, sigma_rad: Array, star_u: Array, pairs: PairTable) -> Integers:
     """Return the star with the highest state for each centroid alone; -1: none, or a tie."""
     star = np.full(len(u), -1, np.int64)
     if len(u) >= 3 and len(star_u) >= 3:

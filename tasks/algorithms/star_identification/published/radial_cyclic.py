@@ -21,6 +21,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial import cKDTree
 
+from epipole.schemas.arrays import Array, Integers
 from epipole.tasks.algorithms.star_identification.centroids import RawCentroids
 from epipole.tasks.algorithms.star_identification.frame import FieldOfView, MatchSettings
 from epipole.tasks.algorithms.star_identification.published.common import (
@@ -33,7 +34,6 @@ from epipole.tasks.algorithms.star_identification.sensor_model import Skies
 from epipole.tasks.algorithms.star_identification.sequence import Priors
 from epipole.tasks.algorithms.star_identification.star_grid import Sky
 
-Array = npt.NDArray[np.float64]
 Bits = npt.NDArray[np.float32]
 
 N_RINGS = 64
@@ -63,9 +63,7 @@ def build_features(star_u: Array, radius_rad: float) -> Features:
     return Features(radius_rad, *_features(star_u, radius_rad, compensated=False))
 
 
-def match_radial_cyclic(
-    u: Array, sigma_rad: Array, star_u: Array, features: Features
-) -> npt.NDArray[np.int64]:
+def match_radial_cyclic(u: Array, sigma_rad: Array, star_u: Array, features: Features) -> Integers:
     """Return the star of each centroid, by radial companions and cyclic features.
 
     Parameters and result as `four_base_stars.match_four_base_stars`; `features` are those of
@@ -101,9 +99,7 @@ def make_matcher(sky: Sky, optics: FieldOfView) -> Matcher:
     return lambda u, sigma_rad: match_radial_cyclic(u, sigma_rad, star_u, features)
 
 
-def least_dissimilar(
-    u: Array, features: Features
-) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]:
+def least_dissimilar(u: Array, features: Features) -> tuple[Integers, Integers]:
     """Return (centroid, star) for the stars least dissimilar to each centroid."""
     none = np.empty(0, np.int64)
     if len(u) < 3 or len(features.radial) == 0:

@@ -24,6 +24,7 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from epipole.schemas.arrays import Array, Integers
 from epipole.tasks.algorithms.kernels import borrowing_kernel, kernel
 from epipole.tasks.algorithms.star_identification.search.lost_in_space import (
     matches_needed,
@@ -82,14 +83,14 @@ class Companions(NamedTuple):
     scale : float, bins per unit of separation
     """
 
-    row: npt.NDArray[np.int64]
-    chord: npt.NDArray[np.float64]
-    tolerance: npt.NDArray[np.float64]
-    angle: npt.NDArray[np.int64]
-    wide: npt.NDArray[np.int64]
-    magnitude: npt.NDArray[np.float64]
-    difference: npt.NDArray[np.float64]
-    first: npt.NDArray[np.int64]
+    row: Integers
+    chord: Array
+    tolerance: Array
+    angle: Integers
+    wide: Integers
+    magnitude: Array
+    difference: Array
+    first: Integers
     scale: float
 
 
@@ -102,10 +103,10 @@ class RollVotes(NamedTuple):
     in_bin : (bins,) uint16, number of votes in each bin of roll
     """
 
-    row: npt.NDArray[np.int64]
-    entry: npt.NDArray[np.int64]
-    roll: npt.NDArray[np.int64]
-    wide: npt.NDArray[np.int64]
+    row: Integers
+    entry: Integers
+    roll: Integers
+    wide: Integers
     in_bin: npt.NDArray[np.uint16]
 
 

@@ -8,8 +8,8 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
+from epipole.schemas.arrays import Array, Flags, Integers
 from epipole.tasks.algorithms.geometry.attitude import copy_matrix, refine_attitude_in, turn
 from epipole.tasks.algorithms.kernels import borrowing_kernel, kernel
 from epipole.tasks.algorithms.star_identification.evidence import (
@@ -18,8 +18,6 @@ from epipole.tasks.algorithms.star_identification.evidence import (
     match_evidence,
 )
 from epipole.tasks.algorithms.star_identification.star_grid import find_in_cone
-
-Array = npt.NDArray[np.float64]
 
 # A centroid between two stars, or a star between two centroids, is matched with the nearer one if
 # that is so much better in chi-square (odds 20:1), and with neither otherwise.
@@ -61,7 +59,7 @@ class Attitude(NamedTuple):
 class Matches(NamedTuple):
     """Each centroid's star (n,) int64, -1 none, and squared distance over sigma squared (n,)."""
 
-    star: npt.NDArray[np.int64]
+    star: Integers
     chi2: Array
 
 
@@ -76,9 +74,9 @@ class _SettleScratch(NamedTuple):
 
     v: Array
     radius: Array
-    before: npt.NDArray[np.int64]
-    owner: npt.NDArray[np.int64]
-    contested: npt.NDArray[np.bool_]
+    before: Integers
+    owner: Integers
+    contested: Flags
     A: Array
 
 

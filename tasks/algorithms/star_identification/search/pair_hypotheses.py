@@ -10,8 +10,8 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
+from epipole.schemas.arrays import Array, Flags, Integers
 from epipole.tasks.algorithms.geometry.attitude import copy_matrix, refine_attitude
 from epipole.tasks.algorithms.kernels import borrowing_kernel, kernel
 from epipole.tasks.algorithms.star_identification.evidence import (
@@ -29,8 +29,6 @@ from epipole.tasks.algorithms.star_identification.star_grid import (
     nearest_star,
 )
 from epipole.tasks.algorithms.star_identification.star_pairs import PairTable
-
-Array = npt.NDArray[np.float64]
 
 # Fastest observer near the Earth over the speed of light: 29.8 km/s of the Earth and some 3 km/s
 # beside it. Aberration changes a separation by at most this share.
@@ -110,8 +108,8 @@ class PairScratch(NamedTuple):
     gain: Array
     fall: Array
     radius: Array
-    row_of: npt.NDArray[np.int64]
-    no_order: npt.NDArray[np.int64]
+    row_of: Integers
+    no_order: Integers
 
 
 @kernel
@@ -352,9 +350,9 @@ class Best(NamedTuple):
     R : (3, 3) float
     """
 
-    evidence: npt.NDArray[np.float64]
-    clustered: npt.NDArray[np.bool_]
-    R: npt.NDArray[np.float64]
+    evidence: Array
+    clustered: Flags
+    R: Array
 
 
 @kernel

@@ -10,14 +10,13 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from epipole.schemas.arrays import Array
 from epipole.tasks.algorithms.kernels import borrowing_kernel, kernel
 from epipole.tasks.algorithms.star_identification.search.pair_hypotheses import (
     MAX_BETA,
     pair_attitude,
 )
 from epipole.tasks.algorithms.star_identification.star_grid import cell_at, cells_of_cone
-
-Array = npt.NDArray[np.float64]
 
 CELLS = 32  # along each side of the image
 DETECTED_SHARE = 0.4  # of the stars in an image that are among the centroids, at least

@@ -17,6 +17,7 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from epipole.schemas.arrays import Integers
 from epipole.tasks.algorithms.kernels import borrowing_kernel, kernel
 from epipole.tasks.algorithms.star_identification.search.pair_hypotheses import MAX_BETA
 from epipole.tasks.algorithms.star_identification.star_pairs import TURN, range_of
@@ -37,12 +38,12 @@ class Votes(NamedTuple):
     """
 
     cast: npt.NDArray[np.uint8]
-    reached: npt.NDArray[np.int64]
-    companion: npt.NDArray[np.int64]
-    low: npt.NDArray[np.int64]
-    high: npt.NDArray[np.int64]
-    angle: npt.NDArray[np.int64]
-    wide: npt.NDArray[np.int64]
+    reached: Integers
+    companion: Integers
+    low: Integers
+    high: Integers
+    angle: Integers
+    wide: Integers
 
 
 @kernel
@@ -201,12 +202,12 @@ class RefinedVotes(NamedTuple):
     bins : (bins,) int16, the votes of each bin
     """
 
-    star: npt.NDArray[np.int64]
-    turn: npt.NDArray[np.int64]
-    wide: npt.NDArray[np.int64]
-    pair: npt.NDArray[np.int64]
-    way: npt.NDArray[np.int64]
-    companion: npt.NDArray[np.int64]
+    star: Integers
+    turn: Integers
+    wide: Integers
+    pair: Integers
+    way: Integers
+    companion: Integers
     bins: npt.NDArray[np.int16]
 
 

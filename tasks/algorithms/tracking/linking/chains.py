@@ -3,13 +3,11 @@
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 from scipy.optimize import linear_sum_assignment
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-Array = npt.NDArray[np.float64]
-Indices = npt.NDArray[np.int64]
+from epipole.schemas.arrays import Array, Indices
 
 NONE = -1
 

@@ -16,9 +16,9 @@ from the apparent rate. `link_by_likelihood` works in these steps:
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 from scipy.special import chdtri
 
+from epipole.schemas.arrays import Array, Indices
 from epipole.tasks.algorithms.constants import LN_2PI
 from epipole.tasks.algorithms.kernels import kernel
 from epipole.tasks.algorithms.tracking.linking.chains import (
@@ -35,9 +35,6 @@ from epipole.tasks.algorithms.tracking.sky_filter import (
     cubic_span,
     jerk,
 )
-
-Array = npt.NDArray[np.float64]
-Indices = npt.NDArray[np.int64]
 
 MAX_ARC_RAD = 0.5  # maximum arc between fragments, for which a plane approximates the sky
 SEARCH_SIGMA = 6.0  # gate of the quick test; most pairs fail it

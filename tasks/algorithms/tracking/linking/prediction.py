@@ -13,9 +13,9 @@ vector, which share one covariance, and the comparison is made on the plane of t
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 from scipy.special import chdtri
 
+from epipole.schemas.arrays import Array
 from epipole.tasks.algorithms.kernels import kernel
 from epipole.tasks.algorithms.tracking.linking.chains import (
     Fragments,
@@ -23,9 +23,6 @@ from epipole.tasks.algorithms.tracking.linking.chains import (
     Links,
     choose_links,
 )
-
-Array = npt.NDArray[np.float64]
-Indices = npt.NDArray[np.int64]
 
 MAX_GAP_S = 90.0  # maximum gap unless one is given: the process noise does not suit longer ones
 DEGREES_OF_FREEDOM = 4  # of one time: those of the window are almost fully correlated
