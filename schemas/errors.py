@@ -1,4 +1,6 @@
-"""Errors that a user can put right. Each message says what is wrong, where, and what to do.
+"""Errors and warnings that a user can put right.
+
+Each message says what is wrong, where, and what to do.
 
 The command line prints the message as one line and exits with a non-zero code. Any other error
 is a fault of the program and shows its traceback.
@@ -35,3 +37,7 @@ class DatasetError(EpipoleError):
 
 class ReportError(EpipoleError):
     """A report that cannot be drawn or written."""
+
+
+class LogWarning(UserWarning):
+    """A log that is written, and holds a mistake or what a reader leaves out."""

@@ -2,6 +2,7 @@
 
 import heapq
 import os
+import warnings
 from collections.abc import Iterator
 from typing import Any, NamedTuple
 
@@ -12,10 +13,14 @@ from epipole.io.logs import reader
 from epipole.io.logs.messages.batches import valid_sensor_id
 from epipole.io.logs.writer import LogWriter
 from epipole.schemas.bridge import rows_of, table, table_name, to_polars
+from epipole.schemas.errors import LogWarning
+from epipole.schemas.log_checks import mistakes
 from epipole.schemas.log_messages import SENSOR_ID_RULE
+from epipole.schemas.rejects import Reason
 from epipole.schemas.settings import SensorSettings
 from epipole.schemas.work_tables import CAMERAS, EXPOSURES, SENSOR_STATES
 from epipole.tasks.algorithms.geometry.camera import Camera
+from epipole.tasks.read.judge_sensor import judge_log
 from epipole.tasks.read.states_to_gcrf import states_to_gcrf
 
 
@@ -108,7 +113,7 @@ def write_log(
     *,
     encoding: str = "protobuf",
 ) -> None:
-    """Write a log from tables like those of `read_log`.
+    """Write a log from tables like those of `read_log`, and say what is wrong with it.
 
     Parameters
     ----------
@@ -130,10 +135,11 @@ def write_log(
         the lists of a frame differ in length; where a sensor's id is invalid;
         where the encoding is unknown.
 
-    Notes
+    Warns
     -----
-    Values beyond the bounds of a log are written all the same; a reader leaves them out and says
-    why (`LogTables.rejects`).
+    LogWarning
+        For each mistake that `epipole doctor` names in the log, and for each reason why a reader
+        leaves something out. The log is written all the same.
 
     Examples
     --------
@@ -153,6 +159,17 @@ def write_log(
     with LogWriter(path, encoding=encoding) as log:
         for time_ns, kind, row in messages:
             _write(log, kind, time_ns, row)
+    for found in _found_in(path):
+        warnings.warn(f"{os.fspath(path)}: {found}", LogWarning, stacklevel=2)
+
+
+def _found_in(path: str | os.PathLike[str]) -> Iterator[str]:
+    """Yield a sentence for each mistake in a log, and for each reason in its rejects."""
+    log = reader.read_log(path)
+    yield from mistakes(judge_log(log, SensorSettings().state_gap_s).to_pylist())
+    counts = to_polars(log.rejects).group_by("reason").agg(pl.col("count").sum())
+    for reason, count in counts.sort("reason").iter_rows():
+        yield f"rejects of a reader: {count} {reason}. {Reason(reason).sentence}"
 
 
 def _checked(schema: pa.Schema, rows: pl.DataFrame) -> pl.DataFrame:

@@ -17,7 +17,7 @@ from epipole.tasks.algorithms.log_checks.findings import (
 )
 from epipole.tasks.algorithms.sensor_faults.fault_judgement import Doubt
 from epipole.tasks.check.check_sensors import SensorVerdict
-from epipole.tasks.read.judge_logs import checks_table
+from epipole.tasks.read.judge_sensor import checks_table
 
 SIGMAS = 4.0  # within which an offset is that of half the exposure
 SHARP = 10.0  # sigmas of half an exposure: with fewer, any offset may look like it

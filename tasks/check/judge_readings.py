@@ -28,7 +28,7 @@ from epipole.tasks.algorithms.log_checks.meeting_lines import (
 )
 from epipole.tasks.algorithms.orbits.reference_frames import orientation_at, to_gcrf
 from epipole.tasks.common.stage_tasks import stage_task
-from epipole.tasks.read.judge_logs import checks_table
+from epipole.tasks.read.judge_sensor import checks_table
 
 MAX_SPANS = 2  # that are looked at
 MAX_EPOCHS = 4  # of a span

@@ -28,7 +28,7 @@ from epipole.tasks.common.stage_tasks import stage_task
 from epipole.tasks.name.elements_of_night import ElementsOfNight
 from epipole.tasks.name.known_objects import catalogue_of
 from epipole.tasks.name.known_tracklets import sampled_tracklets
-from epipole.tasks.read.judge_logs import checks_table, sentence_of
+from epipole.tasks.read.judge_sensor import checks_table, sentence_of
 
 LOGGER = logging.getLogger(__name__)
 

@@ -10,7 +10,7 @@ from polars.testing import assert_frame_equal
 
 from epipole.flows import api
 from epipole.io.logs.writer import LogWriter
-from epipole.schemas.errors import LogError
+from epipole.schemas.errors import LogError, LogWarning
 from epipole.tasks.algorithms.orbits.reference_frames import EME2000_FROM_GCRF
 
 TIME = datetime.datetime(2019, 4, 1, 4, tzinfo=datetime.UTC)
@@ -120,6 +120,26 @@ def test_missing_columns_are_named(tmp_path):
     frames, states, cameras = tables()
     with pytest.raises(ValueError, match=r"table frames: missing columns \['x_px'\]"):
         api.write_log(tmp_path / "a.mcap", frames.drop("x_px"), states, cameras)
+
+
+def test_a_sound_log_is_written_without_a_warning(night_log, tmp_path, recwarn):
+    log = api.read_log(night_log)
+    api.write_log(tmp_path / "a.mcap", log.frames, log.states, log.cameras)
+    assert not recwarn.list
+
+
+def test_a_mistake_in_what_is_written_is_a_warning(night_log, tmp_path):
+    log = api.read_log(night_log)
+    in_m = [pl.col(name) * 1000 for name in ("x_km", "y_km", "z_km")]
+    with pytest.warns(LogWarning, match=r"a\.mcap: .*: positions are in metres"):
+        api.write_log(tmp_path / "a.mcap", log.frames, log.states.with_columns(in_m), log.cameras)
+    assert api.read_log(tmp_path / "a.mcap").states.height == log.states.height
+
+
+def test_what_a_reader_leaves_out_is_a_warning(tmp_path):
+    made = tables(exposure_s=[9999.0])
+    with pytest.warns(LogWarning, match=r"rejects of a reader: 1 bad_exposure\. The frame's"):
+        api.write_log(tmp_path / "a.mcap", *made)
 
 
 def test_a_file_that_is_no_log_is_named(tmp_path):

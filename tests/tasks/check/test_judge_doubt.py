@@ -6,7 +6,7 @@ from epipole.tasks.algorithms.log_checks.findings import FRAME_TIMES, UNKNOWN, F
 from epipole.tasks.algorithms.sensor_faults.fault_judgement import Doubt
 from epipole.tasks.check.check_sensors import SensorVerdict
 from epipole.tasks.check.judge_doubt import doubt_table, name_cut_times
-from epipole.tasks.read.judge_logs import checks_table
+from epipole.tasks.read.judge_sensor import checks_table
 
 WHOLE = Finding(FRAME_TIMES, UNKNOWN, 1.0, expected=0.0, unit="s", cause="whole_times")
 

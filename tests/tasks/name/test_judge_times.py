@@ -5,7 +5,7 @@ import pytest
 
 from epipole.tasks.algorithms.known_objects.time_offset import TimeOffset
 from epipole.tasks.name.judge_times import finding_of
-from epipole.tasks.read.judge_logs import sentence_of
+from epipole.tasks.read.judge_sensor import sentence_of
 
 
 @pytest.mark.parametrize(

@@ -9,30 +9,20 @@ from epipole.io.logs.reader import read_log
 from epipole.schemas.log_checks import LISTED, CheckVerdict, LogCause, LogCheck, mistakes
 from epipole.tasks.algorithms.log_checks import findings
 from epipole.tasks.algorithms.log_checks.findings import WRONG, Finding
-from epipole.tasks.read.judge_logs import checks_table, judge_sensor, sensor_log
+from epipole.tasks.read.judge_sensor import checks_table, judge_log
 
 ROOT = Path(__file__).parents[3]
 SHARED = Path(__file__).resolve().parents[4] / "shared" / "data"
 GAP_S = 10.0
 
 
-def judged(log):
-    """Return the findings of each sensor in the content of a log."""
-    sensors = {*log.states["sensor_id"].to_pylist(), *log.exposures["sensor_id"].to_pylist()}
-    left_out = log.rejects["sensor_id"].drop_null().unique().to_pylist()
-    return {
-        name: judge_sensor(
-            sensor_log(name, [log.exposures], [log.states], log.cameras, log.rejects), GAP_S
-        )
-        for name in sorted({*sensors, *left_out})
-    }
-
-
 def wrong(log):
-    return {
-        name: [found.cause for found in each if found.verdict == WRONG]
-        for name, each in judged(log).items()
-    }
+    """Return the causes of the mistakes of each sensor in the content of a log."""
+    found = {}
+    for row in judge_log(log, GAP_S).to_pylist():
+        causes = found.setdefault(row["sensor_id"], [])
+        causes += [row["cause"]] if row["verdict"] == WRONG else []
+    return found
 
 
 @pytest.fixture(scope="module")
