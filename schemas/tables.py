@@ -116,7 +116,9 @@ STARS = schema(
         column("star_id", I64, doc="Number in the catalogue that the table's metadata names."),
         column("magnitude", F64, unit="mag", doc="V magnitude in the catalogue."),
         *PIXEL,
-        *axes("d{}_px", unit="px", frame="image", doc="Measured minus predicted place", names="xy"),
+        *axes(
+            "d{}_px", unit="px", frame="image", doc="Measured minus predicted position", names="xy"
+        ),
     ],
 )
 
@@ -229,8 +231,8 @@ ASSOCIATIONS = schema(
             "centroid",
             I32,
             null=True,
-            doc="Centroid in the nearest frame; null where the object was missed in it. Its place "
-            "then comes from the tracklet.",
+            doc="Centroid in the nearest frame; null where the object was missed in it. Its "
+            "position then comes from the tracklet.",
         ),
         id_column(
             "tracklet_id", null=True, doc="Null for a detection that belongs to no tracklet."
@@ -345,8 +347,8 @@ OBJECTS = schema(
 
 IDENTIFICATIONS = schema(
     "identifications",
-    "One row per object, and with a catalogue one per tracklet that belongs to none, held against "
-    "a catalogue of known objects.",
+    "One row per object, and with a catalogue one per tracklet that belongs to none, compared "
+    "with a catalogue of known objects.",
     [
         id_column("object_id", null=True, doc="Null in the row of a tracklet."),
         id_column("tracklet_id", null=True, doc="Null in the row of an object."),
@@ -381,8 +383,8 @@ IDENTIFICATIONS = schema(
             F64,
             unit="km",
             null=True,
-            doc="Distance from its place; of a tracklet, and of an object without positions, that "
-            "of the place from a line of sight.",
+            doc="Distance from its position; of a tracklet, and of an object without positions, "
+            "that of the position from a line of sight.",
         ),
         column(
             "mahalanobis",

@@ -21,7 +21,7 @@ LOGGER = logging.getLogger(__name__)
 
 # Files in the kernel folder, one per function, once all of the list is compiled; for a bar only.
 FILES_OF_THE_LIST = 350
-LOOKED_EVERY_S = 0.5
+LOOKED_EVERY_S = 2.0  # a bar needs no more; a look lists all folders
 
 
 def compile_kernels(backwards: bool = False) -> None:
@@ -110,7 +110,11 @@ def report_compiling(report: Callable[[int, int], None], total: int = 0) -> Iter
 def _count() -> int | None:
     """Return the number of files in the kernel folder; None: there is no folder yet."""
     folder = kernel_folder()
-    return None if folder is None else sum(1 for _ in folder.glob("*/*.nbi"))
+    return None if folder is None else sum(map(_files_in, os.scandir(folder)))
+
+
+def _files_in(module: os.DirEntry[str]) -> int:
+    return sum(name.endswith(".nbi") for name in os.listdir(module)) if module.is_dir() else 0
 
 
 def compile_into(folder: Path) -> None:
