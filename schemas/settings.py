@@ -180,7 +180,7 @@ class IdentificationSettings(Group):
         le=3600,
         description="Limit of the searches of one frame, in seconds of a reference machine: work "
         "is counted. Averaged over a sensor's frames they may take a tenth of it. Frames that are "
-        "not searched to the end for it have the status `search_limit`.",
+        "not searched to the end for it have the status `search_limit` or `time_limit`.",
     )
     calibrate: Literal["use", "report", "off"] = Field(
         "use",

@@ -25,9 +25,7 @@ from epipole.tasks.algorithms.star_catalogue import (
     star_directions,
     star_sigmas,
 )
-from epipole.tasks.algorithms.star_identification import star_grid as skies
-from epipole.tasks.algorithms.star_identification import star_pairs as kvector
-from epipole.tasks.algorithms.star_identification import star_pairs as pair_table
+from epipole.tasks.algorithms.star_identification import star_grid, star_pairs
 from epipole.tasks.algorithms.star_identification.frame import FieldOfView
 from epipole.tasks.algorithms.star_identification.star_grid import (
     Sky,
@@ -44,7 +42,7 @@ from epipole.tasks.algorithms.times import earth_barycentric, julian_year
 SURE_PX = 0.5
 
 # The code that makes the arrays on disk: if it changes, they are made again.
-_MADE_BY: tuple[ModuleType, ...] = (star_catalogue, time_scales, pair_table, kvector, skies)
+_MADE_BY: tuple[ModuleType, ...] = (star_catalogue, time_scales, star_pairs, star_grid)
 
 
 class Catalogue:

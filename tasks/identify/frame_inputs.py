@@ -44,7 +44,7 @@ class FlatCentroids(NamedTuple):
     x_px: Array
     y_px: Array
     flux: Array
-    sigma_px: Array  # NaN where unknown
+    sigma_px: Array  # NaN where the sensor states none; a missing one is the median of the others
     u: Array  # sensor axes at the frame's time
     pixel_rad: Array
     in_image: Flags  # of the frame's camera; false without one
@@ -64,6 +64,8 @@ def flatten_centroids(
     sigma_px = _optional(exposures, "sigma_px", len(x_px))
     if settings.centroid_sigma_px is not None:
         sigma_px = np.where(np.isnan(sigma_px), settings.centroid_sigma_px, sigma_px)
+    elif np.isfinite(sigma_px).any():
+        sigma_px = np.where(np.isnan(sigma_px), np.nanmedian(sigma_px), sigma_px)
     camera_of_frame, used = _cameras_of(exposures, cameras)
     u, pixel_rad = np.zeros((len(x_px), 3)), np.ones(len(x_px))
     row_s, turn = np.zeros(len(x_px)), np.zeros((len(x_px), 3))

@@ -37,6 +37,7 @@ from epipole.tasks.identify.tabulate import (
     rejects_table,
     solutions_table,
     stars_table,
+    used_sigma_px,
 )
 
 LOGGER = logging.getLogger(__name__)
@@ -211,7 +212,7 @@ def _with_optics(
             continue
         stars = np.flatnonzero(np.isin(of, solved))
         at = m.at[stars]
-        sigma_rad = np.where(np.isnan(c.sigma_px[at]), 1.0, c.sigma_px[at]) * c.pixel_rad[at]
+        sigma_rad = used_sigma_px(c, at, m.floor_px) * c.pixel_rad[at]
         offsets = np.append(np.searchsorted(of[stars], solved), len(stars))
         cov = shared_attitude_covariance(camera, cov_optics, c.u[at], sigma_rad, offsets)
         shared[solved] = cov / ARCSEC**2

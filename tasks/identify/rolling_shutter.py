@@ -17,8 +17,8 @@ from epipole.tasks.algorithms.geometry.turning import angular_rates, turned
 from epipole.tasks.algorithms.star_identification.sensor import IdentifiedSensor
 from epipole.tasks.identify.frame_inputs import FlatCentroids
 
-# Rates that are assumed of a sensor, 1-sigma [rad/s], until enough of its frames are identified: as
-# its prior attitudes tell, or at rest; 0.1; 1 degree per second. Share of frames that is enough.
+# 1-sigma of the unknown rate of a sensor [rad/s], tried in this order until this share of its
+# frames is identified. 0: the rate of the prior attitudes, or rest.
 UNKNOWN_RATES, ENOUGH = (0.0, 2e-3, 2e-2), 0.5
 # Most rounds with rates from attitudes, and the change of directions that ends them: the first
 # attitudes are of centroids without a correction, and so a little off.
@@ -50,23 +50,25 @@ def identify_at_frame_times(
     q = stack(frame_states, "q{}", "xyzw")
     has_prior = np.isfinite(q[:, 3])
     stated = at_frame_times(c, angular_rates(t_s, matrix_from_quaternion(q), has_prior))
-    best, most = identify(stated), -1
+    best, most, c = identify(stated), -1, stated
     for rate in UNKNOWN_RATES:
-        found = best if not rate else identify(with_unknown_rate(stated, rate))
+        tried = stated if not rate else with_unknown_rate(stated, rate)
+        found = best if not rate else identify(tried)
         solved = 0 if found[0] is None else int(found[0].solutions.solved.sum())
         if solved > most:
-            best, most = found, solved
+            best, most, c = found, solved, tried
         if most > ENOUGH * len(t_s):
             break
-    c = stated
     for _ in range(ROUNDS):
         if best[0] is None or most < 2:
             break
         solutions, before = best[0].solutions, c.turn
-        c = at_frame_times(c, angular_rates(t_s, solutions.R_sensor_from_icrs, solutions.solved))
+        c = at_frame_times(
+            stated, angular_rates(t_s, solutions.R_sensor_from_icrs, solutions.solved)
+        )
         best = identify(c)
         most = 0 if best[0] is None else int(best[0].solutions.solved.sum())
-        if np.abs(c.turn - before).max() < SETTLED_PX * c.pixel_rad.min():
+        if np.abs(c.turn - before).max() < SETTLED_PX * np.nanmin(c.pixel_rad):
             break
     return best, c
 

@@ -43,6 +43,7 @@ def within_limit(frame: Integers, flux: Array, max_detections: int) -> Flags:
     """Return which detections are kept, so that there are at most `max_detections`.
 
     The fullest frames are cut to one number, and keep their brightest. Frames with fewer keep all.
+    What the limit leaves then goes to the brightest of those that are next in their frames.
 
     Parameters
     ----------
@@ -57,7 +58,12 @@ def within_limit(frame: Integers, flux: Array, max_detections: int) -> Flags:
     order = np.lexsort((-np.nan_to_num(flux, nan=-np.inf), frame))
     rank = np.empty(len(frame), np.int64)
     rank[order] = np.arange(len(frame)) - np.repeat(np.cumsum(counts) - counts, counts)
-    return np.asarray(rank < _max_per_frame(counts, max_detections))
+    most = _max_per_frame(counts, max_detections)
+    kept = rank < most
+    following = order[rank[order] == most]
+    brightest = np.argsort(-np.nan_to_num(flux[following], nan=-np.inf), kind="stable")
+    kept[following[brightest[: max_detections - int(kept.sum())]]] = True
+    return np.asarray(kept)
 
 
 def _max_per_frame(counts: Integers, max_detections: int) -> int:
@@ -154,6 +160,12 @@ def stars_table(
     )
 
 
+def used_sigma_px(c: FlatCentroids, at: Integers, floor_px: float) -> Array:
+    """Return the 1-sigma errors of centroids that stars were identified with, before the scale of
+    each frame: as stated, with the floor; 1 px where the sensor states none."""
+    return np.where(np.isnan(c.sigma_px[at]), 1.0, np.hypot(c.sigma_px[at], floor_px))
+
+
 def solutions_table(
     exposures: pa.Table,
     frame_states: pa.Table,
@@ -223,8 +235,7 @@ def detections_table(
     frame = c.frame[at]
     u_icrs = np.einsum("nji,nj->ni", a.R[frame], c.u[at])
     ra, dec = radec_from_unit(u_icrs)
-    sigma_px = np.where(np.isnan(c.sigma_px[at]), 1.0, np.hypot(c.sigma_px[at], m.floor_px))
-    sigma_px *= m.scale[frame]
+    sigma_px = used_sigma_px(c, at, m.floor_px) * m.scale[frame]
     rows = table(
         DETECTIONS,
         _frame_key(exposures, frame)

@@ -6,12 +6,13 @@ from scipy.spatial import cKDTree
 
 from epipole.schemas.arrays import Array, Flags, Integers
 from epipole.schemas.bridge import array
-from epipole.tasks.algorithms.constants import ARCSEC
-from epipole.tasks.algorithms.geometry.camera import Camera, unproject
+from epipole.tasks.algorithms.constants import ARCSEC, SECOND_NS
+from epipole.tasks.algorithms.geometry.camera import Camera, row_offset_s, unproject
 from epipole.tasks.algorithms.geometry.directions import matrix_from_quaternion
+from epipole.tasks.algorithms.geometry.turning import angular_rates, turned
 from epipole.tasks.algorithms.orbits.planets import planet_directions
 from epipole.tasks.algorithms.tracking.hot_pixels import FixedPositions, fixed_positions
-from epipole.tasks.common.sightings import Frames, Sightings
+from epipole.tasks.common.sightings import Frames, Sightings, camera_of
 
 GATE_SIGMA = 4.0  # largest distance of a detection from a known hot pixel, planet or star
 
@@ -75,9 +76,9 @@ def at_star(sightings: Sightings, rows: Integers, stars: Array) -> Flags:
     return np.asarray(off < GATE_SIGMA * sighting_sigma(sightings)[rows])
 
 
-def star_directions(frames: Frames, stars: pa.Table, camera: Camera) -> Array:
+def star_directions(frames: Frames, stars: pa.Table, cameras: pa.Table) -> Array:
     """Return where each star of STARS was measured, the mean over its frames: (s, 3) unit vectors,
-    ICRS, with the aberration of the sensor."""
+    ICRS, with the aberration of the sensor. `cameras` are those of `frames`."""
     by_number = np.argsort(frames.number, kind="stable")
     number = array(stars, "frame_number")
     if not len(number) or not len(by_number):
@@ -85,9 +86,18 @@ def star_directions(frames: Frames, stars: pa.Table, camera: Camera) -> Array:
     at = np.minimum(np.searchsorted(frames.number[by_number], number), len(by_number) - 1)
     frame = by_number[at]
     known = frames.number[frame] == number
-    u = unproject(camera, array(stars, "x_px")[known], array(stars, "y_px")[known])
-    R = matrix_from_quaternion(frames.q_sensor_from_icrs)[frame[known]]
-    u = np.einsum("nij,ni->nj", R, u)
+    x_px, y_px, frame = array(stars, "x_px")[known], array(stars, "y_px")[known], frame[known]
+    R = matrix_from_quaternion(frames.q_sensor_from_icrs)
+    u, row_s = np.empty((len(frame), 3)), np.zeros(len(frame))
+    for row in np.unique(frames.camera[frame]).tolist():
+        camera, of = camera_of(cameras, row), frames.camera[frame] == row
+        u[of] = unproject(camera, x_px[of], y_px[of])
+        row_s[of] = row_offset_s(camera, y_px[of])
+    if row_s.any():  # as they were at the times of the frames
+        t_s = (frames.time_ns - frames.time_ns[0]) / SECOND_NS
+        rates = angular_rates(t_s, R, np.ones(len(t_s), np.bool_))
+        u = turned(u, -rates[frame] * row_s[:, None])
+    u = np.einsum("nij,ni->nj", R[frame], u)
     ids, star = np.unique(array(stars, "star_id")[known], return_inverse=True)
     mean = np.column_stack([np.bincount(star, u[:, a], minlength=len(ids)) for a in range(3)])
     return np.asarray(mean / np.linalg.norm(mean, axis=1, keepdims=True))

@@ -199,7 +199,8 @@ class _TrackedFrames(NamedTuple):
 
     frames: Frames
     sightings: Sightings
-    camera: Camera
+    camera: Camera  # of the first frame
+    cameras: pa.Table  # of all
     interval_s: float
     on_sky: bool
 
@@ -213,14 +214,14 @@ def _parts(
         camera = camera_of(cameras, int(frames.camera[0]))
         interval_s = frame_interval_ns(frames.time_ns) / 1e9
         seen = sightings_of(frames, detections, cameras)
-        yield _TrackedFrames(frames, seen, camera, interval_s, True)
+        yield _TrackedFrames(frames, seen, camera, cameras, interval_s, True)
     unsolved = unsolved_frames(solutions)
     if len(unsolved.number):
         camera = camera_of(cameras, int(unsolved.camera[0]))
         # The interval of all frames: frames without an attitude may be far apart.
         interval_s = frame_interval_ns(np.sort(array(solutions, "time"))) / 1e9
         sightings = image_sightings_of(unsolved, detections, camera)
-        yield _TrackedFrames(unsolved, sightings, camera, interval_s, False)
+        yield _TrackedFrames(unsolved, sightings, camera, cameras, interval_s, False)
 
 
 def _follow(part: _TrackedFrames, sightings: Sightings, settings: TrackletSettings) -> Integers:
@@ -266,7 +267,7 @@ def _label(
     track = _follow(part, sightings, settings)
     runs = measure_runs(frames, sightings, track, camera, half_width_s)
     if part.on_sky:
-        u_stars = star_directions(frames, identified, camera)
+        u_stars = star_directions(frames, identified, part.cameras)
         still = _unlisted_stars(sightings, runs, u_stars)
         stars = [run for run, is_star in zip(runs, still, strict=True) if is_star]
         runs = [run for run, is_star in zip(runs, still, strict=True) if not is_star]

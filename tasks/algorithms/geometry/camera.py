@@ -91,9 +91,9 @@ class Camera(NamedTuple):
 
 
 def mirrored(camera: Camera) -> Camera:
-    """Return the camera of the same image with its rows counted the other way round.
+    """Return the camera with y up instead of down; pixel positions and principal point stay.
 
-    The sky stays as it is seen: x right, y down. A mirror changes the sign of `p1`.
+    A mirror changes the sign of `p1`.
     """
     return camera._replace(fy_px=-camera.fy_px, p1=-camera.p1)
 

@@ -239,11 +239,15 @@ def few_stars_covariance(camera: Camera, cov_optics: Array) -> Array:
 
 
 def _grid(camera: Camera) -> Array:
-    """Return directions all over the image, sensor frame: (81, 3)."""
+    """Return directions all over the image, sensor frame: (n, 3), 81 of most lenses.
+
+    In the corners of a wide lens's image, a position may have no direction.
+    """
     middle = (np.arange(GRID) + 0.5) / GRID
     side, down = (middle * size - 0.5 for size in (camera.width, camera.height))
     x_px, y_px = (axis.ravel() for axis in np.meshgrid(side, down))
-    return unproject(camera, x_px, y_px)
+    u = unproject(camera, x_px, y_px)
+    return u[np.isfinite(u[:, 2])]
 
 
 def _apparent_turns(camera: Camera, u: Array) -> Array:

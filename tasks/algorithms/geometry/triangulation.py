@@ -77,7 +77,7 @@ def start_point(use, r, u, x):
                 N[i, j] += p
                 rhs[i] += p * r[v, j]
     det = invert_symmetric(N, inverse)
-    # Two lines at angle t give det = n (n/2) ... sin^2 t; below 1e-6 rad it is rounding.
+    # Two lines at an angle t give det = 2 sin^2 t: below some 2e-6 rad it is rounding.
     if det < 1e-12 * n**3:
         return False
     for i in range(3):
@@ -227,6 +227,7 @@ def _solve_groups(offsets, lines, velocity, reject2, out):
         chi2[g] = np.nan
         while len(use) >= 2:
             if not start_point(use, r, u, x[g]):
+                chi2[g] = np.nan  # the views that are left are parallel
                 break
             chi2[g] = solve_point(use, lines, velocity[g], x[g], P[g])
             if len(use) < 3 or np.isnan(chi2[g]):

@@ -6,7 +6,7 @@ from scipy.spatial.transform import Rotation
 from epipole.schemas.arrays import Array, Flags
 
 # Attitudes farther apart than this in time, or by this angle, tell no rate [s, rad]. A sensor that
-# turns faster than 12 deg/s has jumped.
+# turns faster than 11.5 deg/s has jumped.
 MAX_APART_S, MAX_TURNED, MAX_RATE = 10.0, 0.5, 0.2
 # Rates before and after a frame are averaged if they differ by less than this share, or by this
 # [rad/s], which errors of attitudes cause at 10 Hz. Otherwise the sensor began to turn, or stopped.
@@ -51,12 +51,14 @@ def angular_rates(t_s: Array, R: Array, known: Flags) -> Array:
 def _of_both(before: Array, after: Array, before_s: Array, after_s: Array) -> Array:
     """Return rates (n, 3) from those before and after, which hold for some seconds each; NaN
     without both."""
-    slow, fast = np.linalg.norm(before, axis=1), np.linalg.norm(after, axis=1)
-    near = np.linalg.norm(after - before, axis=1) < SAME_SHARE * np.fmax(slow, fast) + SAME_RATE
+    fast_before, fast_after = np.linalg.norm(before, axis=1), np.linalg.norm(after, axis=1)
+    fastest = np.fmax(fast_before, fast_after)
+    near = np.linalg.norm(after - before, axis=1) < SAME_SHARE * fastest + SAME_RATE
     total_s = np.where(near, before_s + after_s, 1.0)
     # Of two rates, the one over the shorter time is nearer to that of the frame.
     mean = (before * (after_s / total_s)[:, None]) + after * (before_s / total_s)[:, None]
-    one = np.where(~(slow > fast)[:, None] & np.isfinite(slow)[:, None], before, after)
+    of_before = ~(fast_before > fast_after) & np.isfinite(fast_before)
+    one = np.where(of_before[:, None], before, after)  # the slower one, or the only one
     return np.where(near[:, None], mean, one)
 
 

@@ -192,7 +192,7 @@ def _field_stars(R, reach, beta, stars, memory, scratch):
 
 @inlined_kernel
 def _solve_near(k, frames, stars, rule, memory, scratch, solutions):
-    """Identify frame k near the attitude in `room`; return whether its stars confirm it."""
+    """Identify frame k near the attitude in `scratch`; return whether its stars confirm it."""
     camera = frames.camera[k]
     reach = frames.half_diagonal[camera] + 1e-4
     reach += 4.0 * math.sqrt(max(scratch.P[0, 0], scratch.P[1, 1]))

@@ -240,10 +240,14 @@ def _settle_quality(
         found = frame_scales(chi2 * quality**2, dof)
         if np.ptp(found) == 0.0 or np.abs(np.log(found / quality)).max() < SETTLED:
             break
-        quality = found
+        ratio2, quality = (found / quality) ** 2, found
         scaled = frames.of_quality(quality).scaled(model)
         again = identify_again(frames.t_s, scaled, solutions, sky, model.matching)
         lost = np.flatnonzero(solutions.solved & ~again.solved)
         again.enter_all(lost, solutions, lost)
+        # What is kept of these was found with their errors before.
+        again.cov_rad2[lost] *= ratio2[lost, None, None]
+        at = np.isin(frame, lost)
+        again.chi2[at] /= ratio2[frame[at]]
         solutions = again
     return solutions, quality

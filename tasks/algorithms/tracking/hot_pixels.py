@@ -248,17 +248,23 @@ def _rates(time_s: Array, path: Array) -> tuple[Array, Array]:
 
 
 def _pointings(time_s: Array, path: Array, pixel_rad: float) -> Indices:
-    """Return the number of repointings before each frame.
+    """Return the number of the pointing of each frame.
 
-    At a repointing, the rate changes by more than the apparent motion of an object can.
+    Between two pointings the rate changes by more than the apparent motion of an object can. The
+    frame at which it does belongs to the slower side: a slew is between two frames, and the first
+    frame after it is of what the sensor looks at then.
     """
     rate, dt = _rates(time_s, path)
     change = np.linalg.norm(np.diff(rate, axis=0, prepend=rate[:1]), axis=1)
-    bound = np.array([acceleration(r) for r in np.linalg.norm(rate, axis=1)])
+    speed = np.linalg.norm(rate, axis=1)
+    bound = np.array([acceleration(r) for r in speed])
     # A repointing affects two rates. The smaller one is the possible rate of an object.
     bound[1:] = np.minimum(bound[1:], bound[:-1])
     jumped = change * dt > REPOINTED_PX * pixel_rad + MOTION_BOUND * bound * dt * dt
-    return np.concatenate([[0], np.cumsum(jumped)]).astype(np.int64)
+    at = np.flatnonzero(jumped)
+    begins = np.zeros(len(time_s), bool)
+    begins[np.where(speed[at - 1] <= speed[at], at + 1, at)] = True
+    return np.cumsum(begins, dtype=np.int64)
 
 
 def _turns_fast(time_s: Array, path: Array) -> bool:

@@ -89,7 +89,8 @@ class TrackRule(NamedTuple):
     """When a track begins and ends.
 
     max_rate : maximum rate [rad/s]
-    max_coast, max_missed : maximum time [s] and number of successive frames without a detection
+    max_coast : maximum time between two frames of a track [s]
+    max_missed : maximum number of successive frames without a detection
     min_detections : minimum number of detections of a new track
     gate2 : maximum chi-square at which a detection continues a track
     field_sr : solid angle of the field [sr]

@@ -108,7 +108,7 @@ def follow_detections(
     sigma_rad : (n,) float
         1-sigma error per axis, of centroid and attitude together [rad].
     max_rate_rad_s, max_coast_s
-        Maximum rate of an object, and maximum time without a detection within a track.
+        Maximum rate of an object, and maximum time between two frames of a track.
     max_missed
         Number of successive misses after which a track ends, unless its motion is known so well
         that a false detection in its gate is improbable (`MAX_STRAYS`).

@@ -5,15 +5,19 @@ from pathlib import Path
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
+from scenes.cameras import cameras_of
 from scenes.whole_logs import read_whole
 
 from epipole.io.logs.writer import LogWriter
-from epipole.schemas.bridge import array, stack
+from epipole.schemas.bridge import array, stack, table
 from epipole.schemas.settings import Settings
-from epipole.tasks.identify.frame_inputs import interpolate_sensor_states
+from epipole.schemas.work_tables import EXPOSURES
+from epipole.tasks.algorithms.geometry.camera import Camera
+from epipole.tasks.identify.frame_inputs import flatten_centroids, interpolate_sensor_states
 
 START_NS = 1_554_091_200_000_000_000
 SECOND_NS = 1_000_000_000
+CAMERA = Camera(512, 512, 1000.0, 1000.0, 255.5, 255.5)
 LOGS = Path(__file__).resolve().parents[4] / "shared" / "data" / "logs"
 
 
@@ -42,6 +46,16 @@ def test_places_go_row_by_row_with_the_exposures(tmp_path):
     for name in ("sensor_id", "frame_number", "time"):
         assert places[name].equals(log.exposures[name])
     np.testing.assert_allclose(array(places, "x_km"), [7500.0] * 5 + [7000.0] * 5, atol=1e-9)
+
+
+def test_a_missing_centroid_sigma_is_the_median_of_the_sensors_others():
+    key = {"sensor_id": ["a"] * 3, "frame_number": [0, 1, 2], "time": [0, 1, 2]}
+    lists = {"x_px": [[1.0], [2.0], [3.0]], "y_px": [[1.0], [2.0], [3.0]]}
+    rest = {"exposure_s": [0.0] * 3, "flux": [None] * 3, "source": ["a"] * 3, "offset": [0] * 3}
+    for stated, expected in [([[0.2], None, [0.4]], [0.2, 0.3, 0.4]), ([None] * 3, [np.nan] * 3)]:
+        exposures = table(EXPOSURES, key | lists | rest | {"sigma_px": stated})
+        found = flatten_centroids(exposures, cameras_of({"a": CAMERA}), Settings().sensors)
+        np.testing.assert_allclose(found.sigma_px, expected)
 
 
 def test_unknown_sigmas_are_those_of_the_settings(tmp_path):

@@ -6,6 +6,7 @@ import pyarrow as pa
 import pytest
 from scenes.cameras import cameras_of
 from scenes.identified import identified, tracked
+from scipy.spatial.transform import Rotation
 
 from epipole.flows.command_line.log_info import of_sensor
 from epipole.schemas.bridge import table
@@ -14,8 +15,10 @@ from epipole.schemas.given_settings import validate_settings
 from epipole.schemas.settings import Settings
 from epipole.schemas.tables import DETECTIONS, STARS
 from epipole.schemas.work_tables import SOLUTIONS
-from epipole.tasks.algorithms.geometry.camera import Camera, unproject
+from epipole.tasks.algorithms.geometry.camera import Camera, project, row_offset_s, unproject
 from epipole.tasks.algorithms.geometry.directions import radec_from_unit
+from epipole.tasks.common.sightings import Frames
+from epipole.tasks.track.classify_detections import star_directions
 
 SCENE = """
 name = "kinds"
@@ -332,3 +335,49 @@ def test_what_rests_where_no_star_is_may_be_an_object():
 def test_what_moves_away_from_a_star_is_an_object():
     built = resting(runs_at=[10], identified_at=range(100, 140), rate_arcsec_s=30.0)
     assert set(built.detections["kind"].to_pylist()) == {"object"}
+
+
+def frames_of(rotation_vectors, camera):
+    """Return Frames of one sensor at rest in GCRF, one a second, with these attitudes."""
+    n = len(camera)
+    q = Rotation.from_rotvec(rotation_vectors).as_quat()
+    at = np.zeros((n, 3))
+    second = np.arange(n)
+    return Frames(
+        pa.table({}), second, second * 10**9, q, np.zeros((n, 3, 3)), np.ones(n, bool),
+        at, at, np.zeros(n), np.array(camera),
+    )  # fmt: skip
+
+
+def stars_at(x_px, y_px):
+    n = len(x_px)
+    frame = {"frame_number": np.arange(n), "star_id": np.full(n, 7)}
+    return pa.table(frame | {"x_px": np.array(x_px), "y_px": np.array(y_px)})
+
+
+STAR = np.array([0.02, 0.08, 1.0]) / np.linalg.norm([0.02, 0.08, 1.0])
+FULL = Camera(1024, 1024, 5000.0, 5000.0, 511.5, 511.5)
+
+
+def test_a_star_is_where_each_frames_camera_puts_it():
+    binned = Camera(512, 512, 2500.0, 2500.0, 255.5, 255.5)
+    pixels = [project(camera, STAR[None]) for camera in (FULL, binned)]
+    stars = stars_at(*np.array(pixels)[:, :, 0].T)
+    cameras = cameras_of({"a": FULL, "b": binned})
+    found = star_directions(frames_of(np.zeros((2, 3)), [0, 1]), stars, cameras)
+    np.testing.assert_allclose(found, [STAR], atol=1e-9)
+
+
+def test_a_star_of_a_rolling_shutter_is_where_it_was_at_the_time_of_the_frame():
+    camera, rate = FULL._replace(line_time_s=2e-5), np.array([0.0, np.radians(0.3), 0.0])
+    turns, pixels = np.outer(np.arange(4), rate), []
+    for turn in turns:
+        late_s = 0.0
+        for _ in range(5):
+            u = Rotation.from_rotvec(rate * late_s).apply(Rotation.from_rotvec(turn).apply(STAR))
+            x, y = project(camera, u[None])
+            late_s = row_offset_s(camera, y)[0]
+        pixels.append((x[0], y[0]))
+    stars = stars_at(*np.array(pixels).T)
+    found = star_directions(frames_of(turns, [0] * 4), stars, cameras_of({"a": camera}))
+    np.testing.assert_allclose(found, [STAR], atol=1e-8)  # without it 4e-5

@@ -23,7 +23,7 @@ from epipole.tasks.algorithms.star_identification.star_grid import find_in_cone
 # that is so much better in chi-square (odds 20:1), and with neither otherwise.
 CLEARLY_BETTER = 6.0
 N_NUDGED = 12  # brightest centroids onto which a predicted star is moved
-MAX_COMPARED = 100_000_000  # pairs of a centroid and a star for this, at most: about 10 ms
+MAX_COMPARED = 100_000_000  # pairs of all tries for this; most are far apart: about 10 ms
 MAX_MAG_ERROR = 2.5  # a match whose brightness is farther off is a coincidence
 
 
@@ -282,7 +282,7 @@ def best_nudge(R0, s_xy, s_z, centroids, a, gate, R):
 
     The best one brings most other centroids near stars. For predictions with an error wider than
     the stars are apart. The `N_NUDGED` brightest centroids are tried, until `MAX_COMPARED`
-    distances have been compared.
+    pairs of a centroid and a star are spent.
 
     Parameters
     ----------

@@ -121,6 +121,17 @@ def test_attitude_and_principal_point_compensate_each_other():
     assert np.sqrt(ours.max()) < 0.05 * np.sqrt(alone.min())
 
 
+def test_corners_that_show_nothing_are_left_out():
+    folds = Camera(1000, 1000, 500.0, 500.0, 499.5, 499.5, k1=-0.25)
+    assert np.isnan(unproject(folds, np.zeros(1), np.zeros(1))).all()
+    cov = np.diag([1.0, 1.0, 0.25, 0.25, 1e-6, 1e-6, 1e-8, 1e-8, 1e-6])
+    u = unproject(folds, np.array([500.0, 600.0, 300.0]), np.array([500.0, 400.0, 650.0]))
+    for from_stars in (True, False):
+        found = shared_direction_covariance(folds, cov, u, np.full(3, from_stars))
+        assert np.isfinite(found).all()
+    assert np.isfinite(few_stars_covariance(folds, cov)).all()
+
+
 def test_no_attitudes_have_no_covariances():
     none = np.empty((0, 3))
     cov = shared_attitude_covariance(CAMERA, np.eye(9), none, np.empty(0), np.zeros(1, int))

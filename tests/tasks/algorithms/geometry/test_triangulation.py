@@ -125,6 +125,15 @@ def test_parallel_lines_and_points_behind_have_no_position():
     assert np.isnan(x).all()
 
 
+def test_views_that_are_parallel_without_a_wrong_one_have_no_position():
+    r = np.array([[7000.0, 0, 0], [7000.0, 0.02, 0], [0, 7000.0, 0]])
+    u = look(r, GEO)
+    u[2] = look(r[2:], GEO + np.array([0, 0, 100.0]))[0]
+    _, _, chi2, used, *_ = solve(r, u, ARCSEC, sigma_km=0.001)
+    assert np.isnan(chi2[0])
+    assert not used.any()
+
+
 def test_nothing_in_gives_nothing_out():
     x, cov, chi2, used, mean_range, *_ = solve(
         np.zeros((0, 3)), np.zeros((0, 3)), ARCSEC, offsets=np.zeros(1, int)

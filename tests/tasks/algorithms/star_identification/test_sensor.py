@@ -165,6 +165,20 @@ def test_frames_of_another_exposure_are_identified_though_their_zero_point_diffe
     assert _identify(shots).solutions.solved.sum() >= 29
 
 
+def test_errors_of_frames_that_are_not_matched_again_stay_what_they_were():
+    """Their brightness is off by more than a match may be, so later passes lose their stars."""
+    true_px = np.where(np.random.default_rng(0).random(40) < 0.5, 0.1, 0.3)
+    shots = [_shot(k, true_px[k], missing=0.0)[0] for k in range(40)]
+    for k in range(0, 40, 5):
+        longer = shots[k].frame
+        longer = longer._replace(instrumental_mag=longer.instrumental_mag - 3.0)
+        shots[k] = shots[k]._replace(frame=longer)
+    found = _identify(shots)
+    assert found.solutions.solved.all()
+    ratio = found.sigma_scale / true_px
+    assert (np.abs(np.log(ratio)) < np.log(1.6)).all()
+
+
 @pytest.mark.parametrize("period", [2, 3, 5])
 def test_a_sensor_that_sees_the_sky_in_few_frames_is_identified_in_these(period):
     dark = [_shot(k, 0.15, n_false=25, missing=1.0)[0] for k in range(120)]

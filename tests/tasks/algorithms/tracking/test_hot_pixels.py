@@ -119,6 +119,18 @@ def test_what_is_seen_in_one_of_two_pointings_is_no_hot_pixel():
     assert not find(frame[kept], x[kept], y[kept], t, q).any()
 
 
+@pytest.mark.parametrize("slew_s", [1, 2, 3])
+@pytest.mark.parametrize("first", [10, 20, 25])
+def test_an_object_that_is_followed_after_a_slew_is_no_hot_pixel(first, slew_s):
+    t = np.arange(60.0)
+    after = t - first
+    turn = np.interp(after, [-slew_s, 0.0], [0.0, 0.35]) + 4e-4 * np.maximum(after, 0.0)
+    q = quaternion_from_rotation_vector(np.outer(turn, [0.0, 1.0, 0.0]))
+    frame, x, y, fixed = image(8, 60, OFF_MIDDLE)
+    kept = ~fixed | (frame >= first)
+    assert not find(frame[kept], x[kept], y[kept], t, q).any()
+
+
 def test_pointing_jitter_is_no_repointing():
     rng = np.random.default_rng(7)
     t = np.arange(60.0)
