@@ -210,7 +210,10 @@ class TrackletSettings(Group):
         "it moves so evenly that a false detection in its gate is improbable.",
     )
     min_detections: int = Field(
-        3, ge=2, le=1000, description="Minimum number of detections of a tracklet."
+        3,
+        ge=2,
+        le=1000,
+        description="Minimum number of detections of a tracklet. Two alone never make one.",
     )
     false_alarm: float = Field(
         1e-4, gt=0, lt=1, description="Accepted number of false tracklets per frame."

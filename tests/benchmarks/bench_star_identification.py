@@ -43,7 +43,7 @@ from epipole.tasks.algorithms.star_identification.frame import (
     FieldOfView,
     FrameCentroids,
     MatchSettings,
-    identify_lost,
+    search_frame,
 )
 from epipole.tasks.algorithms.star_identification.published import (
     four_base_stars,
@@ -105,7 +105,7 @@ class Ours:
         matching = self.matching._replace(
             starlit=float(np.log((self.solved + 1) / (self.refused + 1)))
         )
-        found, _ = identify_lost(seen, self.sky, grid, self.pairs, matching)
+        found = search_frame(seen, self.sky, grid, self.pairs, matching).solution
         self.solved, self.refused = self.solved + bool(found), self.refused + (not found)
         return found and found.R_sensor_from_icrs
 

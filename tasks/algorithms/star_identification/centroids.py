@@ -209,7 +209,8 @@ def static_centroids(first: Integers, x_px: Array, y_px: Array) -> Flags:
     frame = np.repeat(np.arange(n_frames), np.diff(first))
     stays = np.zeros(len(x_px), np.bool_)
     at = np.flatnonzero(np.isfinite(x_px) & np.isfinite(y_px))
-    # A position at the border of two pixels is in the middle of a shifted one.
+    # A position at the corner of four pixels is in the middle of a shifted one; at a side it has
+    # half of its frames in each of two, which is enough.
     for shift in (0.0, 0.5):
         cell = _cells(x_px[at] + shift, y_px[at] + shift)
         once = np.unique(cell * n_frames + frame[at]) // n_frames

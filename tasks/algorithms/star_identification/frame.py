@@ -239,11 +239,9 @@ def _least_of_lost(
 
 def aberrate_all(u_icrs: Array, beta: Array) -> Array:
     """Return the directions that an observer at beta (v / c) sees; see `directions.aberrate`."""
-    out = np.empty_like(u_icrs)
-    p = u_icrs @ beta
-    g = np.sqrt(1.0 - beta @ beta)
-    out[:] = g * u_icrs + (1.0 + p / (1.0 + g))[:, None] * beta
-    return out / np.linalg.norm(out, axis=1, keepdims=True)
+    p, g = u_icrs @ beta, np.sqrt(1.0 - beta @ beta)
+    seen = g * u_icrs + (1.0 + p / (1.0 + g))[:, None] * beta
+    return np.asarray(seen / np.linalg.norm(seen, axis=1, keepdims=True))
 
 
 def search_lost(
@@ -461,15 +459,6 @@ def search_frame(
         return Searched(None, verdict.exhausted, over, cost_s)
     found = _near_verdict(frame, sky, verdict, matching)
     return Searched(found, False, False, cost_s, verdict.crowded and found is not None)
-
-
-def identify_lost(
-    frame: FrameCentroids, sky: Sky, grid: SkyGrid, pairs: PairTable, matching: MatchSettings
-) -> tuple[Solution | None, bool]:
-    """Return the solution without a prior, None where no attitude is beyond doubt, and whether the
-    search reached a limit."""
-    found = search_frame(frame, sky, grid, pairs, matching)
-    return found.solution, found.exhausted
 
 
 # Clusters of false centroids: a reflection, a bright object's halo, a damaged part of the chip.

@@ -326,7 +326,7 @@ def _likeliest_scale(
     """Return the model with the centroid error that explains solved frames best, and their
     solutions with it."""
     best, most, chosen = model, -np.inf, solutions
-    for scale in (model.scale, *scales):
+    for scale in dict.fromkeys((model.scale, *scales)):
         frames = centroids.frames(scale, model.use_flux).each()
         again = rematch(frames, solutions, skies.sky(model.limit), model.matching)
         evidence = sum(s.evidence for s in again if s is not None)

@@ -11,6 +11,7 @@ import numpy.typing as npt
 from scipy.spatial import cKDTree
 
 from epipole.schemas.arrays import Array, Integers
+from epipole.tasks.algorithms.geometry.directions import tangent_basis
 from epipole.tasks.algorithms.kernels import borrowing_kernel
 
 TURN = 1 << 16  # a full turn in units of a stored position angle: differences wrap by themselves
@@ -122,7 +123,7 @@ class PairTable(NamedTuple):
         flat at small separations and loses half of the digits there.
     first, second : (n,) int32, rows of the catalogue, first the brighter
     at_first, at_second : (n,) uint16, position angle of the other star as seen from each,
-        in parts of `TURN`, from `tangent_axes`
+        in parts of `TURN`, from `tangent_basis`
     n_stars : how many of the brightest stars of the catalogue may be in a pair
     near : the pairs that are closer than `NEAR_SHARE` of the longest, star by star
     """
@@ -144,7 +145,7 @@ def build_pair_table(u_icrs: Array, max_separation_rad: float) -> PairTable:
     chord = np.linalg.norm(u_icrs[pairs[:, 0]] - u_icrs[pairs[:, 1]], axis=1)
     order = np.lexsort((pairs[:, 1], pairs[:, 0], chord))
     a, b = np.ascontiguousarray(pairs[order].T)
-    along, across = tangent_axes(u_icrs)
+    along, across = np.moveaxis(tangent_basis(u_icrs), 1, 0)
     at_a = position_angle(along[a], across[a], u_icrs[b])
     at_b = position_angle(along[b], across[b], u_icrs[a])
     near = _near_stars(a, b, chord[order], at_a, at_b, len(u_icrs), NEAR_SHARE * reach)
@@ -171,17 +172,6 @@ def _near_stars(
         np.concatenate([at_a[:n], at_b[:n]])[order],
         reach,
     )
-
-
-def tangent_axes(
-    u: Array,
-) -> tuple[Array, Array]:
-    """Return two (n, 3) unit vectors that complete each direction to a right-handed frame."""
-    # Any two will do. The axis crossed with the direction is never parallel to it.
-    near_z = np.abs(u[:, 2:]) > 0.9
-    along = np.cross(np.where(near_z, [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]), u)
-    along /= np.linalg.norm(along, axis=1, keepdims=True)
-    return along, np.cross(u, along)
 
 
 def position_angle(along: Array, across: Array, other: Array) -> npt.NDArray[np.uint16]:

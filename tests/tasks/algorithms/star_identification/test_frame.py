@@ -19,7 +19,6 @@ from epipole.tasks.algorithms.star_identification.frame import (
     N_PATTERN,
     N_SEARCHED,
     aberrate_all,
-    identify_lost,
     identify_predicted,
     search_frame,
     search_lost,
@@ -146,7 +145,7 @@ def test_a_frame_that_is_no_crowd_has_the_same_solution_in_one_call():
         seen = frame(CATALOGUE, random_attitude(seed), seed, n_false=3, missing=0.1 * seed)[0]
         if not 3 <= len(seen.u) <= N_PATTERN:
             continue
-        found, _ = identify_lost(seen, sky, grid, pairs, MATCHING)
+        found = search_frame(seen, sky, grid, pairs, MATCHING).solution
         verdict = search_lost(seen, sky, grid, pairs, MATCHING)
         if not verdict.is_clear:
             assert found is None

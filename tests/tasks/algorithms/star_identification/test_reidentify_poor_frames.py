@@ -15,7 +15,7 @@ from epipole.tasks.algorithms.star_identification.centroids import unsolved
 from epipole.tasks.algorithms.star_identification.frame import (
     FrameCentroids,
     Solution,
-    identify_lost,
+    search_frame,
 )
 from epipole.tasks.algorithms.star_identification.reidentify_poor_frames import (
     poor_frames,
@@ -37,7 +37,7 @@ WHERE = SensorSky(SKY, GRID, lambda: PAIRS)
 
 
 def searched(seen):
-    return identify_lost(seen, SKY, GRID, PAIRS, MATCHING)[0]
+    return search_frame(seen, SKY, GRID, PAIRS, MATCHING).solution
 
 
 def solved_frames(frames):

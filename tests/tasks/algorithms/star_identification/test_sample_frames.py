@@ -12,7 +12,7 @@ from epipole.tasks.algorithms.star_identification.frame import (
     FieldOfView,
     FrameCentroids,
     MatchSettings,
-    identify_lost,
+    search_frame,
 )
 from epipole.tasks.algorithms.star_identification.star_grid import (
     pattern_pairs,
@@ -63,7 +63,7 @@ def answers(name, matching):
         key = round(np.log2(radius), 1)
         if key not in grids:
             grids[key] = sky_grid(sample.sky, 1.05 * radius)
-        found, _ = identify_lost(seen, sample.sky, grids[key], sample.pairs, matching)
+        found = search_frame(seen, sample.sky, grids[key], sample.pairs, matching).solution
         if found is None:
             continue
         R = found.R_sensor_from_icrs

@@ -16,7 +16,7 @@ from scenes.star_maps import SEEDS, contest_maps, hipparcos_at_epoch
 
 from epipole.tasks.algorithms.geometry.camera import pixel_angle
 from epipole.tasks.algorithms.star_catalogue import NavigationCatalogue, navigation_catalogue
-from epipole.tasks.algorithms.star_identification.frame import FrameCentroids, identify_lost
+from epipole.tasks.algorithms.star_identification.frame import FrameCentroids, search_frame
 from epipole.tasks.algorithms.star_identification.published import (
     four_base_stars,
     match_group,
@@ -102,7 +102,7 @@ def by_default(maps, skies, number):
     sky, seen = skies[number], as_frame(kind, u, sigma_rad)
     stars = sky.catalogue.u_icrs[: pattern_size(sky, seen.optics.solid_angle_sr)]
     pairs = pattern_pairs(stars, 2 * kind.camera.half_diagonal_rad)
-    return identify_lost(seen, sky, sky_grid(sky, 0.01), pairs, MATCHING)[0]
+    return search_frame(seen, sky, sky_grid(sky, 0.01), pairs, MATCHING).solution
 
 
 def assert_right(map_, sky, solution):

@@ -5,8 +5,8 @@ import pytest
 from scenes.random_stars import MATCHING, angle_between, frame, random_attitude, random_catalogue
 
 from epipole.tasks.algorithms.star_identification.frame import (
-    identify_lost,
     problem_of,
+    search_frame,
     search_lost,
 )
 from epipole.tasks.algorithms.star_identification.search.lost_in_space import try_brightest
@@ -48,7 +48,7 @@ def test_any_attitude_is_found(sigma_px, n_false, missing, flux, grid, pairs):
     for seed in range(20):
         R = random_attitude(seed)
         seen, true = frame(CATALOGUE, R, seed, sigma_px, n_false, missing, flux)
-        found, _ = identify_lost(seen, SKY, grid, pairs, MATCHING)
+        found = search_frame(seen, SKY, grid, pairs, MATCHING).solution
         assert found is not None
         assert angle_between(found.R_sensor_from_icrs, R) < 1200 * ARCSEC * sigma_px
         claimed = found.star >= 0
@@ -100,7 +100,7 @@ def test_frames_without_stars_are_refused(grid, pairs):
     rng = np.random.default_rng(0)
     for seed in range(20):
         seen, _ = frame(CATALOGUE, random_attitude(seed), seed, 0.5, int(rng.integers(3, 15)), 1.0)
-        found, _ = identify_lost(seen, SKY, grid, pairs, MATCHING)
+        found = search_frame(seen, SKY, grid, pairs, MATCHING).solution
         assert found is None
 
 
@@ -121,7 +121,7 @@ def test_a_search_ends_when_its_bound_is_reached(grid, pairs):
 def test_centroids_all_on_one_spot_are_refused(grid, pairs):
     seen, _ = frame(CATALOGUE, random_attitude(0), 0)
     spot = seen._replace(u=np.repeat(seen.u[:1], len(seen.u), axis=0))
-    assert identify_lost(spot, SKY, grid, pairs, MATCHING) == (None, False)
+    assert search_frame(spot, SKY, grid, pairs, MATCHING) == (None, False)
 
 
 def test_a_handful_of_centroids_is_never_answered_wrongly(grid, pairs):
@@ -131,25 +131,25 @@ def test_a_handful_of_centroids_is_never_answered_wrongly(grid, pairs):
         few = seen._replace(
             u=seen.u[:4], sigma_rad=seen.sigma_rad[:4], instrumental_mag=seen.instrumental_mag[:4]
         )
-        found, _ = identify_lost(few, SKY, grid, pairs, MATCHING)
+        found = search_frame(few, SKY, grid, pairs, MATCHING).solution
         assert found is None or angle_between(found.R_sensor_from_icrs, R) < 0.01
 
 
 def test_a_place_that_is_none_is_left_aside(grid, pairs):
     seen, _ = frame(CATALOGUE, random_attitude(3), 3)
     seen.u[[1, 4]] = np.nan
-    found, _ = identify_lost(seen, SKY, grid, pairs, MATCHING)
+    found = search_frame(seen, SKY, grid, pairs, MATCHING).solution
     assert angle_between(found.R_sensor_from_icrs, random_attitude(3)) < 1200 * ARCSEC
     assert np.all(found.star[[1, 4]] == -1)
     seen.u[:] = np.nan
-    assert identify_lost(seen, SKY, grid, pairs, MATCHING) == (None, False)
+    assert search_frame(seen, SKY, grid, pairs, MATCHING) == (None, False)
 
 
 @pytest.mark.long
 @pytest.mark.parametrize("sigma_px", [0.05, 0.5, 4.0])
 def test_thousands_of_false_centroids_end_without_an_answer(sigma_px, grid, pairs):
     crowd, _ = frame(CATALOGUE, random_attitude(0), 0, sigma_px, 4000, 1.0)
-    found, _ = identify_lost(crowd, SKY, grid, pairs, MATCHING)
+    found = search_frame(crowd, SKY, grid, pairs, MATCHING).solution
     assert found is None
 
 
