@@ -12,6 +12,7 @@ from epipole.io.work.work_layout import ReadFolder
 from epipole.schemas.bridge import concat
 from epipole.schemas.errors import LogError
 from epipole.schemas.log_checks import CheckVerdict, mistakes
+from epipole.schemas.rejects import left_out
 from epipole.schemas.settings import Settings
 from epipole.schemas.spans import ALL_TIME
 from epipole.schemas.tables import REJECTS
@@ -32,17 +33,24 @@ NOT_SHOWN = (
 
 
 class Diagnosis(NamedTuple):
-    """What the doctor found: CHECKS of all sensors, and counts of what was read."""
+    """What the doctor found: CHECKS of all sensors, counts of what was read, and a sentence for
+    each reason why something was left out."""
 
     checks: pa.Table
     logs: int
     frames: int
     states: int
+    left_out: list[str]
 
     @property
     def mistakes(self) -> list[str]:
         """A sentence for each mistake."""
         return mistakes(self.checks.to_pylist())
+
+    @property
+    def is_sound(self) -> bool:
+        """Whether there is no mistake, and nothing was left out."""
+        return not self.mistakes and not self.left_out
 
 
 def doctor(logs: Sequence[str], settings: Settings = Settings()) -> Diagnosis:  # noqa: B008
@@ -81,6 +89,7 @@ def doctor(logs: Sequence[str], settings: Settings = Settings()) -> Diagnosis:  
             len(given.paths),
             frames.n_frames,
             sum(_states(frames, number) for number in range(len(frames.sensors))),
+            left_out(rejects.to_pylist()),
         )
 
 
@@ -91,8 +100,9 @@ def _states(frames: OrderedFrames, number: int) -> int:
 def as_dict(found: Diagnosis) -> dict[str, Any]:
     """Return a diagnosis for JSON."""
     return {
-        "sound": not found.mistakes,
+        "sound": found.is_sound,
         "mistakes": found.mistakes,
+        "left_out": found.left_out,
         "logs": found.logs,
         "frames": found.frames,
         "states": found.states,
@@ -119,6 +129,8 @@ def lines(found: Diagnosis) -> list[str]:
         "not shown by states and frames (a run compares lines of sight too):",
         *(f"  {each}" for each in NOT_SHOWN),
     ]
+    if found.left_out:
+        out += ["left out, with rows in `rejects`:", *(f"  {each}" for each in found.left_out)]
     wrong = found.mistakes
     if not wrong:
         return [*out, "no mistake found"]

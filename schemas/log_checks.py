@@ -322,6 +322,13 @@ class LogCause(StrEnum):
         "frame numbers alternate between two counters: frames of two sensors have this id",
         "give each sensor an id that no other has",
     )
+    NUMBERS_STAY = (
+        "numbers_stay",
+        CheckVerdict.WRONG,
+        "{count:.0f} of {frames:.0f} frames have the number of the one before; of frames with one "
+        "number the first is used",
+        "count the frames of a sensor: a number that no other frame has",
+    )
     TWO_CALIBRATIONS = (
         "two_calibrations",
         CheckVerdict.WRONG,

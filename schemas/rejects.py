@@ -4,7 +4,8 @@ Each has a sentence, which the documentation shows. A reason also has its stage,
 other modules ask for. `reject_rows` makes the rows of `rejects`.
 """
 
-from collections.abc import Sequence
+from collections import Counter
+from collections.abc import Iterable, Mapping, Sequence
 from enum import Flag, StrEnum, auto
 from typing import Any
 
@@ -513,6 +514,20 @@ class FrameStatus(Declared):
         "`identification.time_limit_s`, and a sensor's frames a tenth of it each on average.",
     )
     NO_CALIBRATION = "no_calibration", "No calibration is valid for the frame."
+
+
+def left_out(rejects: Iterable[Mapping[str, Any]]) -> list[str]:
+    """Return a sentence for each reason in rows of `rejects`, with its count; not for harmless
+    ones."""
+    counts: Counter[str] = Counter()
+    for row in rejects:
+        counts[row["reason"]] += row["count"]
+    harmless = Reason.having(Trait.HARMLESS)
+    return [
+        f"{counts[reason]} {reason.value}: {reason.sentence}"
+        for reason in Reason
+        if reason in counts and reason not in harmless
+    ]
 
 
 def reject_rows(

@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 
 from epipole.schemas.arrays import Array
+from epipole.schemas.log_bounds import SPEED
 
 Time = datetime.datetime | np.datetime64 | str | int
 
@@ -45,6 +46,37 @@ def floats(
     return out
 
 
+def unit_quaternion(name: str, q: Array) -> Array:
+    """Return a quaternion (4,) as it is.
+
+    Raises
+    ------
+    ValueError
+        Where its length is not 1, within a hundredth.
+    """
+    length = float(np.linalg.norm(q))
+    if not 0.99 < length < 1.01:
+        raise ValueError(f"{name}: has length {length:.3g}, expected a unit quaternion")
+    return q
+
+
+def velocity(velocity_km_s: Any) -> Array:
+    """Return a sensor's velocity (3,) [km/s]; None is NaN.
+
+    Raises
+    ------
+    ValueError
+        Where a log's velocity would be refused too: it may be in m/s.
+    """
+    v = floats("velocity_km_s", velocity_km_s, 3, default=np.nan)
+    speed = float(np.linalg.norm(v))
+    if speed > SPEED.maximum:
+        raise ValueError(
+            f"velocity_km_s: {speed:.4g} km/s, expected at most {SPEED.maximum:.4g}; is it in m/s?"
+        )
+    return v
+
+
 def time_ns(time: Time) -> int:
     """Return a time as integer nanoseconds since 1970, UTC. A time without a zone is UTC.
 
@@ -55,15 +87,15 @@ def time_ns(time: Time) -> int:
     """
     try:
         if isinstance(time, int | np.integer) and not isinstance(time, bool):
-            return int(time)
+            return int(np.int64(int(time)))
         if isinstance(time, str):
             time = datetime.datetime.fromisoformat(time)
         if isinstance(time, datetime.datetime):
             zone = time.tzinfo or datetime.UTC
             since = time.replace(tzinfo=zone) - datetime.datetime(1970, 1, 1, tzinfo=datetime.UTC)
-            return (since // datetime.timedelta(microseconds=1)) * 1000
+            return int(np.int64((since // datetime.timedelta(microseconds=1)) * 1000))
         if isinstance(time, np.datetime64) and not np.isnat(time):
             return int(time.astype("datetime64[ns]").astype(np.int64))
-    except ValueError as error:
+    except (ValueError, OverflowError) as error:
         raise ValueError(f"time: {error}") from error
     raise ValueError(f"time: {time!r} is not a time; give a datetime, or nanoseconds since 1970")

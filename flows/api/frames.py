@@ -6,7 +6,14 @@ import numpy as np
 import numpy.typing as npt
 import pyarrow as pa
 
-from epipole.flows.api.arguments import Array, Time, floats, time_ns
+from epipole.flows.api.arguments import (
+    Array,
+    Time,
+    floats,
+    time_ns,
+    unit_quaternion,
+    velocity,
+)
 from epipole.flows.api.objects import View
 from epipole.io.catalogues.star_catalogue import read_star_catalogue
 from epipole.schemas.arrays import Integers
@@ -141,12 +148,10 @@ def identify_frame(
         flux=[None if flux is None else floats("flux", flux, n)],
         sigma_px=[None if sigma_px is None else floats("sigma_px", sigma_px, n, repeat=True)],
     )
-    state = unstack("v{}_km_s", floats("velocity_km_s", velocity_km_s, 3, default=np.nan)[None])
+    state = unstack("v{}_km_s", velocity(velocity_km_s)[None])
     q = floats("prior_xyzw", prior_xyzw, 4, default=np.nan)
-    if prior_xyzw is not None and not 0.99 < np.linalg.norm(q) < 1.01:
-        raise ValueError(
-            f"prior_xyzw: has length {np.linalg.norm(q):.3g}, expected a unit quaternion"
-        )
+    if prior_xyzw is not None:
+        unit_quaternion("prior_xyzw", q)
     state |= unstack("q{}", q[None], "xyzw")
     state["attitude_sigma_arcsec"] = np.array([prior_sigma_arcsec or np.nan], float)
     states = _one_row(
@@ -155,7 +160,7 @@ def identify_frame(
     covariance = unstack_covariance("cov_{}", np.zeros((1, 9, 9)), OPTICS_AXES)
     optics = {name: [value] for name, value in Camera(*camera)._asdict().items()}
     cameras = _one_row(CAMERAS, at_ns, **optics, **covariance)
-    settings = settings or Settings()
+    settings = Settings() if settings is None else settings
     catalogue = read_star_catalogue(settings.identification.catalogue)
     made = identify_stars(
         exposures, states, cameras, catalogue, settings.sensors, settings.identification,
@@ -224,7 +229,7 @@ def view_frame(
     Raises
     ------
     ValueError
-        Where a shape is wrong.
+        Where a shape is wrong, or the attitude is no unit quaternion, as where it is not known.
 
     Examples
     --------
@@ -241,17 +246,18 @@ def view_frame(
     n = len(x)
     u = unproject(Camera(*camera), x, floats("y_px", y_px, n))
     sigma_rad = floats("sigma_px", sigma_px, n, repeat=True) * pixel_angle(Camera(*camera), u)
-    R = matrix_from_quaternion(floats("attitude_xyzw", attitude_xyzw, 4)[None])[0]
+    attitude = unit_quaternion("attitude_xyzw", floats("attitude_xyzw", attitude_xyzw, 4))
+    R = matrix_from_quaternion(attitude[None])[0]
     apparent = u @ R
     error = floats("attitude_cov_arcsec2", attitude_cov_arcsec2, 3, 3, default=0.0)
     cov = centroid_covariance(apparent, sigma_rad)
     cov = cov + attitude_covariance(apparent, R.T @ error @ R * ARCSEC**2)
-    u_icrs = aberrate(apparent, -floats("velocity_km_s", velocity_km_s, 3))
+    u_icrs = aberrate(apparent, -velocity(velocity_km_s))
     return View(
         u_icrs,
         on_tangent_plane(u_icrs, cov),
         floats("position_km", position_km, 3),
         float(position_sigma_km),
-        np.array(attitude_xyzw, float),
+        attitude,
         Camera(*camera),
     )

@@ -16,7 +16,7 @@ from epipole.schemas.bridge import rows_of, table, table_name, to_polars
 from epipole.schemas.errors import LogWarning
 from epipole.schemas.log_checks import mistakes
 from epipole.schemas.log_messages import SENSOR_ID_RULE
-from epipole.schemas.rejects import Reason
+from epipole.schemas.rejects import left_out
 from epipole.schemas.settings import SensorSettings
 from epipole.schemas.work_tables import CAMERAS, EXPOSURES, SENSOR_STATES
 from epipole.tasks.algorithms.geometry.camera import Camera
@@ -167,9 +167,7 @@ def _found_in(path: str | os.PathLike[str]) -> Iterator[str]:
     """Yield a sentence for each mistake in a log, and for each reason in its rejects."""
     log = reader.read_log(path)
     yield from mistakes(judge_log(log, SensorSettings().state_gap_s).to_pylist())
-    counts = to_polars(log.rejects).group_by("reason").agg(pl.col("count").sum())
-    for reason, count in counts.sort("reason").iter_rows():
-        yield f"rejects of a reader: {count} {reason}. {Reason(reason).sentence}"
+    yield from (f"rejects of a reader: {each}" for each in left_out(log.rejects.to_pylist()))
 
 
 def _checked(schema: pa.Schema, rows: pl.DataFrame) -> pl.DataFrame:
@@ -184,8 +182,21 @@ def _checked(schema: pa.Schema, rows: pl.DataFrame) -> pl.DataFrame:
             raise ValueError(
                 f"table {table_name(schema)}: sensor_id {sensor_id!r}: expected {SENSOR_ID_RULE}"
             )
+    _check_written(table_name(schema), checked)
     unknown = [pl.col(name).fill_null(0.0) for name in _UNKNOWN_IS_0 if name in schema.names]
     return checked.with_columns(unknown).sort("time", "sensor_id", maintain_order=True)
+
+
+def _check_written(name: str, rows: pl.DataFrame) -> None:
+    """Raise where a time or a number cannot be written at all."""
+    for column in {"time", "frame_number"} & set(rows.columns):
+        below = rows.filter(pl.col(column).cast(pl.Int64) < 0)
+        if below.height:
+            value, sensor_id = below[column][0], below["sensor_id"][0]
+            lowest = "1970" if column == "time" else "0"
+            raise ValueError(
+                f"table {name}: {column} of {sensor_id} is {value}, expected {lowest} or later"
+            )
 
 
 def _same_lengths(frames: pl.DataFrame) -> pl.DataFrame:

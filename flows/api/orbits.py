@@ -36,6 +36,7 @@ from epipole.tasks.publish.object_orbits import (
 )
 
 NS = "datetime64[ns]"
+_NUMBERS = ["ra_deg", "dec_deg", "sigma_ra_arcsec", "sigma_dec_arcsec", "correlation"]
 
 
 class Attributable(NamedTuple):
@@ -76,7 +77,8 @@ class ObjectOrbit(NamedTuple):
     chi2, dof : float, int
         Weighted sum of squares, and its degrees of freedom.
     used : (n,) bool
-        Which observations were fitted, in the order of the rows; false: of something else.
+        Which observations were fitted, in the order of the rows; false: of something else, or
+        without a direction and its error.
     forces : str
         As in the table `orbits`.
     elements : dict of str to float
@@ -148,10 +150,10 @@ def attributable(
     >>> np.sqrt(np.diag(found.cov_arcsec2)).round(2).tolist()
     [0.62, 0.52, 0.16, 0.16]
     """
-    at_ns = np.asarray(np.asarray(time, NS), np.int64)
-    n = len(at_ns)
-    if not n or (np.diff(at_ns) < 0).any():
-        raise ValueError("time: has no times, or they are not in order")
+    times = np.atleast_1d(np.asarray(time, NS))
+    at_ns, n = times.astype(np.int64), len(times)
+    if not n or np.isnat(times).any() or (np.diff(at_ns) < 0).any():
+        raise ValueError("time: has no times, or one that is none, or they are not in order")
     ra, dec = (
         np.radians(floats(name, values, n))
         for name, values in (("ra_deg", ra_deg), ("dec_deg", dec_deg))
@@ -272,6 +274,11 @@ def fit_orbit(observations: pl.DataFrame, start: npt.ArrayLike | None = None) ->
         raise ValueError("observations: has no rows")
     rows = observations.select(needed).with_row_index("row").sort("time", "sensor_id", "row")
     rows = rows.with_columns(object_id=pl.lit("object"), tracklet_id=pl.lit(None, pl.String))
+    if isinstance(rows.schema["time"], pl.Datetime):
+        rows = rows.with_columns(pl.col("time").dt.cast_time_unit("ns"))
+    rows = rows.filter(pl.all_horizontal(pl.col(_NUMBERS).cast(pl.Float64).is_finite()))
+    if not len(rows):
+        raise ValueError(f"observations: no row has all of {', '.join(_NUMBERS)}")
     times = rows["time"].cast(pl.Int64).to_numpy()
     middle_ns = (int(times[0]) + int(times[-1])) // 2
     night = str(np.datetime64(middle_ns, "ns").astype("datetime64[D]"))
@@ -282,10 +289,10 @@ def fit_orbit(observations: pl.DataFrame, start: npt.ArrayLike | None = None) ->
     epoch, verdict = np.datetime64(middle_ns, "ns"), judge(fitted)
     reason = None if verdict is None else verdict.value
     if fitted is None:
-        nothing, unused = np.full((7, 6), np.nan), np.zeros(len(rows), bool)
+        nothing, unused = np.full((7, 6), np.nan), np.zeros(len(observations), bool)
         none = dict.fromkeys(ELEMENTS, np.nan)
         return ObjectOrbit(epoch, nothing[0], nothing[1:], np.nan, 0, unused, "", none, reason)
-    used = np.zeros(len(rows), bool)
+    used = np.zeros(len(observations), bool)
     used[rows["row"].to_numpy()] = fitted.orbit.used
     turn = state_rotation(around.R_night_from_gcrf.T)
     state = turn @ fitted.orbit.unknowns[:6]

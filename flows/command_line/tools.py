@@ -359,5 +359,5 @@ def doctor(logs: Logs, assume: Assume = None, as_json: AsJson = False) -> None:
         print_json(as_dict(found))
     else:
         print_lines(lines(found))
-    if found.mistakes:
+    if not found.is_sound:
         sys.exit(1)

@@ -96,8 +96,8 @@ class CameraFinding(NamedTuple):
         name, camera = self.sensor_id, self.camera
         if camera is None:
             return (
-                f"{name}: its frames show no stars, with focal lengths 10 % shorter to 11 % longer "
-                "than logged, with distortion and with rows counted upward either"
+                f"{name}: no search finds stars in its frames, with focal lengths 10 % shorter to "
+                "11 % longer than logged, with distortion and with rows counted upward either"
             )
         parts = []
         if (camera.fy_px < 0) != (self.logged.fy_px < 0):

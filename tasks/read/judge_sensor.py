@@ -74,12 +74,16 @@ def sensor_log(
     """Return what EXPOSURES, LOG_STATES, CAMERAS and REJECTS have of one sensor."""
     rows = [_rows_of(of, sensor, between_ns) for of in exposures]
     of_rows = list(zip(exposures, rows, strict=True))
-    stride = max(sum(map(len, rows)) // MAX_SAMPLED, 1)
-    sampled = [of.take(k[::stride]) for of, k in of_rows]
     time_ns, number = (
         np.concatenate([np.zeros(0, np.int64), *(array(of, name)[k] for of, k in of_rows)])
         for name in ("time", "frame_number")
     )
+    chosen = _sample(time_ns, number)
+    ends = np.cumsum([len(k) for k in rows])
+    sampled = [
+        of.take(k[chosen[(chosen >= end - len(k)) & (chosen < end)] - (end - len(k))])
+        for (of, k), end in zip(of_rows, ends, strict=True)
+    ]
     of_sensor = rows_with(rejects, "sensor_id", sensor)
     counts = of_sensor.group_by("reason").aggregate([("count", "sum")])
     return SensorLog(
@@ -90,6 +94,14 @@ def sensor_log(
         rows_with(cameras, "sensor_id", sensor),
         {row["reason"]: row["count_sum"] for row in counts.to_pylist()},
     )
+
+
+def _sample(time_ns: Integers, number: Integers) -> Integers:
+    """Return the rows of at most some `MAX_SAMPLED` frames, evenly chosen; each frame counts once,
+    in whatever pieces it comes."""
+    keys = np.stack([time_ns, number], axis=1)
+    first = np.unique(keys, axis=0, return_index=True)[1] if len(keys) else np.zeros(0, np.int64)
+    return np.sort(first[:: max(len(first) // MAX_SAMPLED, 1)])
 
 
 def _rows_of(rows: pa.Table, sensor: str, between_ns: tuple[int, int]) -> Integers:

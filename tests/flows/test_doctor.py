@@ -5,13 +5,14 @@ import json
 import pytest
 from scenes.log_mistakes import MISTAKES, rewritten, starts_of_exposures
 
+from epipole.flows import api
 from epipole.flows.command_line.main import app
 from epipole.flows.doctor import NOT_SHOWN, as_dict, doctor, lines
 from epipole.flows.evaluate import evaluate
 from epipole.flows.nightly import nightly
 from epipole.io.datasets.dataset import night_reader, read_table
 from epipole.io.logs.reader import read_log
-from epipole.schemas.errors import LogError
+from epipole.schemas.errors import LogError, LogWarning
 from epipole.schemas.log_checks import CheckVerdict
 from epipole.tasks.report.night_facts import needs_look, read_night_facts
 
@@ -45,6 +46,18 @@ def test_a_mistake_ends_with_1_and_has_its_cure(wrong_log):
     (mistake,) = found["mistakes"]
     assert mistake.startswith("sat2: velocities point backwards along the path of positions; ")
     assert lines(doctor([str(wrong_log)]))[-1] == f"  {mistake}"
+
+
+def test_what_a_run_would_leave_out_ends_with_1(night_log, tmp_path):
+    log, copy = api.read_log(night_log), tmp_path / "a.mcap"
+    with pytest.warns(LogWarning, match="bad_camera_matrix"):
+        api.write_log(copy, log.frames, log.states, log.cameras.with_columns(fx_px=0.0))
+    result = run("doctor", copy, "--json")
+    found = json.loads(result.output)
+    assert (result.exit_code, found["sound"], found["mistakes"]) == (1, False, [])
+    (left_out,) = found["left_out"]
+    assert left_out.startswith(f"{log.cameras.height} bad_camera_matrix: ")
+    assert f"  {left_out}" in lines(doctor([str(copy)]))
 
 
 def test_a_file_that_is_no_log_is_refused(tmp_path):

@@ -203,17 +203,21 @@ def known_offset(shift_s: float) -> float:
 
 
 def check_numbers(frames: LogFrames, camera: LogCamera | None) -> list[Finding]:
-    """Return whether frames of two sensors have one id: numbers, or calibrations, alternate."""
+    """Return whether frames of two sensors have one id: numbers, or calibrations, alternate; and
+    whether numbers do not count."""
     if camera is not None and camera.others:
         return [Finding(ONE_SENSOR, WRONG, camera.others, expected=0.0, cause="two_calibrations")]
     if len(frames.all_numbers) < MIN_FRAMES:
         return []
     steps = np.diff(frames.all_numbers)
-    # A counter of two sensors goes back at every second frame; one that starts again, seldom.
-    back = float((steps <= 0).mean())
-    if back < MIN_BACKWARD:
+    # A counter of two sensors goes back at every second frame, and forth; one that starts again,
+    # seldom; one that counts down, never forth.
+    back, same = float((steps < 0).mean()), float((steps == 0).mean())
+    facts = {"count": int((steps == 0).sum()), "frames": len(steps) + 1}
+    if same >= MIN_BACKWARD:
+        return [Finding(ONE_SENSOR, WRONG, same, expected=0.0, cause="numbers_stay", facts=facts)]
+    if back < MIN_BACKWARD or not (steps > 0).any():
         return []
-    facts = {"frames": len(steps) + 1, "share": back}
     return [Finding(ONE_SENSOR, WRONG, back, expected=0.0, cause="numbers_alternate", facts=facts)]
 
 

@@ -116,13 +116,22 @@ def test_an_empty_frame_is_no_error():
         ({"x_px": [[1.0, 2.0]]}, r"x_px: has shape \(1, 2\), expected \(n,\)"),
         ({"velocity_km_s": [7.5]}, r"velocity_km_s: has shape \(1,\), expected \(3,\)"),
         ({"prior_xyzw": [1.0, 1.0, 1.0, 1.0]}, "prior_xyzw: has length 2, expected a unit"),
+        ({"velocity_km_s": [7500.0, 0.0, 0.0]}, "velocity_km_s: 7500 km/s, .* is it in m/s"),
         ({"time": "noon"}, "time: "),
+        ({"time": 2**70}, "time: "),
     ],
 )
 def test_wrong_arguments_of_a_frame_are_named(change, message):
     arguments = {"x_px": [1.0, 2.0], "y_px": [1.0, 2.0], "camera": CAMERA, "time": 0} | change
     with pytest.raises(ValueError, match=message):
         api.identify_frame(**arguments)
+
+
+@pytest.mark.parametrize("attitude", [np.zeros(4), np.full(4, np.nan), [0.0, 0.0, 0.0, 2.0]])
+def test_a_view_without_an_attitude_is_an_error(attitude):
+    where = {"position_km": [7000.0, 0.0, 0.0], "velocity_km_s": np.zeros(3)}
+    with pytest.raises(ValueError, match="attitude_xyzw: has length"):
+        api.view_frame([1.0], [1.0], camera=CAMERA, attitude_xyzw=attitude, sigma_px=0.1, **where)
 
 
 def test_directions_come_back_with_the_scatter_of_their_covariance():

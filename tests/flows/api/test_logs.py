@@ -108,6 +108,8 @@ def test_states_are_in_gcrf_whatever_the_frame_of_the_log(tmp_path):
         ({"brightness": [1.0]}, r"unknown columns \['brightness'\]"),
         ({"time": ["noon"]}, "column time is not timestamp"),
         ({"frame_number": [None]}, "column frame_number"),
+        ({"frame_number": [-1]}, "table frames: frame_number of a is -1, expected 0 or later"),
+        ({"time": [TIME.replace(year=1960)]}, "time of a is 1960-.* expected 1970 or later"),
     ],
 )
 def test_wrong_tables_are_named(tmp_path, change, message):
@@ -138,7 +140,7 @@ def test_a_mistake_in_what_is_written_is_a_warning(night_log, tmp_path):
 
 def test_what_a_reader_leaves_out_is_a_warning(tmp_path):
     made = tables(exposure_s=[9999.0])
-    with pytest.warns(LogWarning, match=r"rejects of a reader: 1 bad_exposure\. The frame's"):
+    with pytest.warns(LogWarning, match=r"rejects of a reader: 1 bad_exposure: The frame's"):
         api.write_log(tmp_path / "a.mcap", *made)
 
 

@@ -47,6 +47,7 @@ def test_the_epoch_can_be_chosen_and_errors_given_one_by_one():
     [
         ({"time": TIME[::-1]}, "not in order"),
         ({"time": TIME[:0]}, "no times"),
+        ({"time": np.append(TIME[:-1], np.datetime64("NaT"))}, "one that is none"),
         ({"ra_deg": [1.0]}, r"ra_deg: has shape \(1,\), expected \(20,\)"),
     ],
 )
@@ -92,6 +93,25 @@ def test_what_is_not_fitted_is_said_row_by_row():
     rows = observations(GEO).with_row_index("n")
     off = rows.with_columns(dec_deg=pl.col("dec_deg") + 0.02 * (pl.col("n") == 5))
     assert np.flatnonzero(~api.fit_orbit(off).used).tolist() == [5]
+
+
+@pytest.mark.parametrize("unit", ["us", "ms"])
+def test_the_unit_of_times_changes_nothing(unit):
+    rows = observations(GEO).with_columns(pl.col("time").dt.round("1ms"))
+    expected = api.fit_orbit(rows)
+    found = api.fit_orbit(rows.with_columns(pl.col("time").dt.cast_time_unit(unit)))
+    assert found.epoch == expected.epoch
+    np.testing.assert_array_equal(found.state, expected.state)
+
+
+def test_a_row_without_a_direction_is_not_fitted():
+    rows = observations(GEO).with_row_index("n")
+    gone = rows.with_columns(ra_deg=pl.when(pl.col("n") != 5).then("ra_deg").otherwise(np.nan))
+    orbit = api.fit_orbit(gone)
+    assert orbit.verdict is None
+    assert np.flatnonzero(~orbit.used).tolist() == [5]
+    with pytest.raises(ValueError, match="no row has all of ra_deg"):
+        api.fit_orbit(rows.with_columns(ra_deg=pl.lit(None, pl.Float64)))
 
 
 def test_too_few_rows_give_no_orbit():

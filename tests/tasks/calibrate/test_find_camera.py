@@ -25,7 +25,7 @@ def test_a_finding_says_what_is_different():
     assert said == ("a: the focal length is 4.2 % longer than logged (3813.7 px, not 3660.0)")
     said = str(CameraFinding("a", TOLD, mirrored(TOLD)))
     assert said == "a: the image is mirrored (y up?)"
-    assert "show no stars" in str(CameraFinding("a", TOLD, None))
+    assert "no search finds stars" in str(CameraFinding("a", TOLD, None))
 
 
 def test_a_finding_says_how_far_distortion_moves_the_corners():

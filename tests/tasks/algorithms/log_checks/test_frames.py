@@ -99,8 +99,15 @@ def test_two_counters_are_two_sensors_and_one_that_starts_again_is_not():
     (found,) = check_numbers(frames(np.arange(80) * 0.5, number=two), CAMERA)
     assert judged(found) == (WRONG, "numbers_alternate")
     assert check_numbers(frames(np.arange(80.0), number=np.arange(80) % 16), CAMERA) == []
+    assert check_numbers(frames(np.arange(80.0), number=80 - np.arange(80)), CAMERA) == []
     (found,) = check_numbers(frames(np.arange(80.0)), CAMERA._replace(others=1))
     assert judged(found) == (WRONG, "two_calibrations")
+
+
+def test_a_number_that_stays_is_named():
+    (found,) = check_numbers(frames(np.arange(80.0), number=np.zeros(80, int)), CAMERA)
+    assert judged(found) == (WRONG, "numbers_stay")
+    assert (found.facts["count"], found.facts["frames"]) == (79, 80)
 
 
 def test_a_principal_point_of_zero_is_named():

@@ -7,6 +7,7 @@ from epipole.io.catalogues.hipparcos import read_hipparcos
 from epipole.schemas.bridge import array
 from epipole.tasks.algorithms.geometry.camera import Camera, inside, mirrored, project, unproject
 from epipole.tasks.algorithms.geometry.directions import canonical, matrix_from_quaternion
+from epipole.tasks.algorithms.star_identification import camera_search
 from epipole.tasks.algorithms.star_identification.camera_search import (
     ImageFrame,
     agreeing_camera,
@@ -113,6 +114,22 @@ def test_no_further_frame_is_searched_beyond_the_budget(skies_of):
     asked = [noise, frame(TRUE, 6)], TRUE, 1.02, skies_of, MATCHING
     assert first_camera(*asked, 0.0) is None
     assert first_camera(*asked).frame == 1
+
+
+def test_a_frame_with_errors_far_too_large_ends_within_the_limit(skies_of, monkeypatch):
+    costs = []
+    search = camera_search.search_frame
+
+    def counted(*arguments):
+        found = search(*arguments)
+        costs.append(found.cost_s)
+        return found
+
+    monkeypatch.setattr(camera_search, "search_frame", counted)
+    vague = frame(TRUE, 7)
+    vague = vague._replace(sigma_px=np.full(len(vague.x_px), 50.0))
+    assert first_camera([vague], TRUE, 1.11, skies_of, MATCHING, 0.0) is None
+    assert sum(costs) < camera_search.FIRST_FRAME_S + 2 * camera_search.TRIAL_TIME_LIMIT_S
 
 
 def test_another_frame_agrees_with_the_true_camera_alone(skies_of):
