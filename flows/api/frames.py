@@ -229,7 +229,7 @@ def view_frame(
     Raises
     ------
     ValueError
-        Where a shape is wrong, or the attitude is no unit quaternion, as where it is not known.
+        Where a shape is wrong, or the attitude is not of length 1, as where it is unknown.
 
     Examples
     --------

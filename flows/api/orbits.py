@@ -153,7 +153,7 @@ def attributable(
     times = np.atleast_1d(np.asarray(time, NS))
     at_ns, n = times.astype(np.int64), len(times)
     if not n or np.isnat(times).any() or (np.diff(at_ns) < 0).any():
-        raise ValueError("time: has no times, or one that is none, or they are not in order")
+        raise ValueError("time: has no times, or NaT, or they are not in order")
     ra, dec = (
         np.radians(floats(name, values, n))
         for name, values in (("ra_deg", ra_deg), ("dec_deg", dec_deg))

@@ -47,7 +47,7 @@ def test_the_epoch_can_be_chosen_and_errors_given_one_by_one():
     [
         ({"time": TIME[::-1]}, "not in order"),
         ({"time": TIME[:0]}, "no times"),
-        ({"time": np.append(TIME[:-1], np.datetime64("NaT"))}, "one that is none"),
+        ({"time": np.append(TIME[:-1], np.datetime64("NaT"))}, "or NaT"),
         ({"ra_deg": [1.0]}, r"ra_deg: has shape \(1,\), expected \(20,\)"),
     ],
 )
