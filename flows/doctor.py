@@ -89,7 +89,7 @@ def doctor(logs: Sequence[str], settings: Settings = Settings()) -> Diagnosis:  
             len(given.paths),
             frames.n_frames,
             sum(_states(frames, number) for number in range(len(frames.sensors))),
-            left_out(rejects.to_pylist()),
+            left_out(rejects),
         )
 
 

@@ -45,7 +45,7 @@ from epipole.flows.night.stages import (
     track,
     write_night,
 )
-from epipole.flows.night.summary import Summary, by_reason, many, summarise
+from epipole.flows.night.summary import Summary, many, summarise
 from epipole.flows.night.work import Work, plan_spans
 from epipole.flows.prefect.artifacts import shown_on_page, tell
 from epipole.flows.prefect.runners import runner_asked
@@ -67,7 +67,7 @@ from epipole.io.work.work_layout import ReadFolder, SolvedParts, WorkFolder
 from epipole.schemas.bridge import concat
 from epipole.schemas.dates import LAST_NIGHTS, YESTERDAY
 from epipole.schemas.errors import EpipoleError, LogError, NoFramesError
-from epipole.schemas.rejects import Reason
+from epipole.schemas.rejects import Reason, by_reason
 from epipole.schemas.run_record import RunState
 from epipole.schemas.settings import Settings
 from epipole.schemas.tables import REJECTS

@@ -4,8 +4,7 @@ Each has a sentence, which the documentation shows. A reason also has its stage,
 other modules ask for. `reject_rows` makes the rows of `rejects`.
 """
 
-from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Sequence
 from enum import Flag, StrEnum, auto
 from typing import Any
 
@@ -516,17 +515,20 @@ class FrameStatus(Declared):
     NO_CALIBRATION = "no_calibration", "No calibration is valid for the frame."
 
 
-def left_out(rejects: Iterable[Mapping[str, Any]]) -> list[str]:
-    """Return a sentence for each reason in rows of `rejects`, with its count; not for harmless
-    ones."""
-    counts: Counter[str] = Counter()
-    for row in rejects:
-        counts[row["reason"]] += row["count"]
-    harmless = Reason.having(Trait.HARMLESS)
+def by_reason(rejects: pa.Table) -> dict[str, int]:
+    """Return the counts of what was left out, by reason, the most frequent first."""
+    counts = rejects.group_by("reason").aggregate([("count", "sum")])
+    ordered = counts.sort_by([("count_sum", "descending"), ("reason", "ascending")])
+    return {row["reason"]: row["count_sum"] for row in ordered.to_pylist()}
+
+
+def left_out(rejects: pa.Table) -> list[str]:
+    """Return a sentence for each reason in REJECTS, with its count; not for harmless ones."""
+    counts = by_reason(rejects)
     return [
         f"{counts[reason]} {reason.value}: {reason.sentence}"
         for reason in Reason
-        if reason in counts and reason not in harmless
+        if reason in counts and Trait.HARMLESS not in reason.traits
     ]
 
 

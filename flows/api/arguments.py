@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from epipole.schemas.arrays import Array
-from epipole.schemas.log_bounds import SPEED
+from epipole.schemas.log_bounds import QUATERNION, SPEED
 
 Time = datetime.datetime | np.datetime64 | str | int
 
@@ -55,20 +55,20 @@ def unit_quaternion(name: str, q: Array) -> Array:
         Where its length is not 1, within a hundredth.
     """
     length = float(np.linalg.norm(q))
-    if not 0.99 < length < 1.01:
+    if not QUATERNION.minimum < length < QUATERNION.maximum:
         raise ValueError(f"{name}: has length {length:.3g}, expected a unit quaternion")
     return q
 
 
-def velocity(velocity_km_s: Any) -> Array:
-    """Return a sensor's velocity (3,) [km/s]; None is NaN.
+def velocity(velocity_km_s: Any, default: float | None = None) -> Array:
+    """Return a sensor's velocity (3,) [km/s]; with `default`, None is that value.
 
     Raises
     ------
     ValueError
         Where a log's velocity would be refused too: it may be in m/s.
     """
-    v = floats("velocity_km_s", velocity_km_s, 3, default=np.nan)
+    v = floats("velocity_km_s", velocity_km_s, 3, default=default)
     speed = float(np.linalg.norm(v))
     if speed > SPEED.maximum:
         raise ValueError(

@@ -7,7 +7,6 @@ import numpy.typing as npt
 import pyarrow as pa
 
 from epipole.flows.api.arguments import (
-    Array,
     Time,
     floats,
     time_ns,
@@ -16,7 +15,7 @@ from epipole.flows.api.arguments import (
 )
 from epipole.flows.api.objects import View
 from epipole.io.catalogues.star_catalogue import read_star_catalogue
-from epipole.schemas.arrays import Integers
+from epipole.schemas.arrays import Array, Integers
 from epipole.schemas.bridge import (
     array,
     nullable,
@@ -148,7 +147,7 @@ def identify_frame(
         flux=[None if flux is None else floats("flux", flux, n)],
         sigma_px=[None if sigma_px is None else floats("sigma_px", sigma_px, n, repeat=True)],
     )
-    state = unstack("v{}_km_s", velocity(velocity_km_s)[None])
+    state = unstack("v{}_km_s", velocity(velocity_km_s, default=np.nan)[None])
     q = floats("prior_xyzw", prior_xyzw, 4, default=np.nan)
     if prior_xyzw is not None:
         unit_quaternion("prior_xyzw", q)
@@ -160,7 +159,7 @@ def identify_frame(
     covariance = unstack_covariance("cov_{}", np.zeros((1, 9, 9)), OPTICS_AXES)
     optics = {name: [value] for name, value in Camera(*camera)._asdict().items()}
     cameras = _one_row(CAMERAS, at_ns, **optics, **covariance)
-    settings = Settings() if settings is None else settings
+    settings = settings or Settings()
     catalogue = read_star_catalogue(settings.identification.catalogue)
     made = identify_stars(
         exposures, states, cameras, catalogue, settings.sensors, settings.identification,

@@ -167,7 +167,7 @@ def _found_in(path: str | os.PathLike[str]) -> Iterator[str]:
     """Yield a sentence for each mistake in a log, and for each reason in its rejects."""
     log = reader.read_log(path)
     yield from mistakes(judge_log(log, SensorSettings().state_gap_s).to_pylist())
-    yield from (f"rejects of a reader: {each}" for each in left_out(log.rejects.to_pylist()))
+    yield from (f"rejects of a reader: {each}" for each in left_out(log.rejects))
 
 
 def _checked(schema: pa.Schema, rows: pl.DataFrame) -> pl.DataFrame:

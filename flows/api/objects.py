@@ -6,8 +6,8 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from epipole.flows.api.arguments import Array, floats
-from epipole.schemas.arrays import Flags, Indices
+from epipole.flows.api.arguments import floats
+from epipole.schemas.arrays import Array, Flags, Indices
 from epipole.schemas.settings import Settings
 from epipole.tasks.algorithms.association.samples import Samples
 from epipole.tasks.algorithms.geometry import triangulation

@@ -6,8 +6,8 @@ import numpy as np
 import numpy.typing as npt
 import polars as pl
 
-from epipole.flows.api.arguments import Array, Time, floats, time_ns
-from epipole.schemas.arrays import Flags
+from epipole.flows.api.arguments import Time, floats, time_ns
+from epipole.schemas.arrays import Array, Flags
 from epipole.schemas.columns import ELEMENTS
 from epipole.schemas.settings import Settings
 from epipole.tasks.algorithms.constants import ARCSEC, SECOND_NS

@@ -11,7 +11,7 @@ import pyarrow.compute as pc
 from epipole.io.datasets.night_tables import Where, count_rows, read_columns
 from epipole.schemas.bridge import array
 from epipole.schemas.log_checks import MISTAKE_COLUMNS, mistakes
-from epipole.schemas.rejects import NameStatus, ObjectVerdict, Outcome, Reason
+from epipole.schemas.rejects import NameStatus, ObjectVerdict, Outcome, Reason, by_reason
 from epipole.schemas.stages import Declared
 from epipole.tasks.report.night_facts import ReportExtract
 
@@ -282,13 +282,6 @@ def _of_sensor(frames: pa.Table, tracklets: pa.Table, sensor_id: str) -> SensorS
         gap_s=float(np.diff(times_ns).max() * 1e-9) if len(times_ns) > 1 else None,
         tracks=pc.count_distinct(tracklets["track_id"]).as_py(),
     )
-
-
-def by_reason(rejects: pa.Table) -> dict[str, int]:
-    """Return the counts of what was left out, by reason, the most frequent first."""
-    counts = rejects.group_by("reason").aggregate([("count", "sum")])
-    ordered = counts.sort_by([("count_sum", "descending"), ("reason", "ascending")])
-    return {row["reason"]: row["count_sum"] for row in ordered.to_pylist()}
 
 
 def many(count: int, what: str) -> str:

@@ -110,11 +110,7 @@ def report_compiling(report: Callable[[int, int], None], total: int = 0) -> Iter
 def _count() -> int | None:
     """Return the number of files in the kernel folder; None: there is no folder yet."""
     folder = kernel_folder()
-    return None if folder is None else sum(map(_files_in, os.scandir(folder)))
-
-
-def _files_in(module: os.DirEntry[str]) -> int:
-    return sum(name.endswith(".nbi") for name in os.listdir(module)) if module.is_dir() else 0
+    return None if folder is None else sum(1 for _ in folder.glob("*/*.nbi"))
 
 
 def compile_into(folder: Path) -> None:

@@ -120,15 +120,20 @@ def _row_times(
     frames: Frames, detections: pa.Table, row: Indices, frame: Indices, cameras: pa.Table
 ) -> Indices:
     """Return the times of the image rows of detections [ns]."""
-    time_ns = frames.time_ns[frame]
+    late_s = row_offsets_s(cameras, frames.camera[frame], array(detections, "y_px")[row])
+    return frames.time_ns[frame] + np.rint(late_s * SECOND_NS).astype(np.int64)
+
+
+def row_offsets_s(cameras: pa.Table, camera: Integers, y_px: Array) -> Array:
+    """Return the times of image rows (n,) after those of their frames [s]; `camera` (n,) are rows
+    of CAMERAS, negative where there is none."""
+    late_s = np.zeros(len(y_px))
     if not cameras.num_rows or not array(cameras, "line_time_s").any():
-        return time_ns
-    y_px = array(detections, "y_px")[row].astype(float)
-    late_s = np.zeros(len(row))
-    for k in np.unique(frames.camera[frames.camera >= 0]).tolist():
-        at = frames.camera[frame] == k
-        late_s[at] = row_offset_s(camera_of(cameras, k), y_px[at])
-    return time_ns + np.rint(late_s * SECOND_NS).astype(np.int64)
+        return late_s
+    for k in np.unique(camera[camera >= 0]).tolist():
+        at = camera == k
+        late_s[at] = row_offset_s(camera_of(cameras, k), y_px[at].astype(float))
+    return late_s
 
 
 def image_sightings_of(frames: Frames, detections: pa.Table, camera: Camera) -> Sightings:

@@ -28,6 +28,7 @@ from epipole.tasks.algorithms.orbits.state_interpolation import (
     SensorStates,
     interpolate_states,
 )
+from epipole.tasks.algorithms.star_identification.centroids import filled_sigmas
 
 LOGGER = logging.getLogger(__name__)
 
@@ -64,8 +65,7 @@ def flatten_centroids(
     sigma_px = _optional(exposures, "sigma_px", len(x_px))
     if settings.centroid_sigma_px is not None:
         sigma_px = np.where(np.isnan(sigma_px), settings.centroid_sigma_px, sigma_px)
-    elif np.isfinite(sigma_px).any():
-        sigma_px = np.where(np.isnan(sigma_px), np.nanmedian(sigma_px), sigma_px)
+    sigma_px = filled_sigmas(sigma_px)
     camera_of_frame, used = _cameras_of(exposures, cameras)
     u, pixel_rad = np.zeros((len(x_px), 3)), np.ones(len(x_px))
     row_s, turn = np.zeros(len(x_px)), np.zeros((len(x_px), 3))

@@ -1,6 +1,7 @@
 """Judge a sensor's log: units, frames, times and cameras, as they were written."""
 
 from collections.abc import Iterable, Mapping, Sequence
+from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
@@ -10,7 +11,7 @@ import pyarrow.compute as pc
 from epipole.schemas.arrays import Integers
 from epipole.schemas.bridge import array, concat, flatten, nullable, rows_with, stack, table
 from epipole.schemas.log_checks import LogCause, LogCheck
-from epipole.schemas.rejects import Reason
+from epipole.schemas.rejects import Reason, by_reason
 from epipole.schemas.spans import ALL_TIME
 from epipole.schemas.tables import CHECKS
 from epipole.schemas.work_tables import EXPOSURES, ITRF, LOG_STATES, LogContents
@@ -79,20 +80,18 @@ def sensor_log(
         for name in ("time", "frame_number")
     )
     chosen = _sample(time_ns, number)
-    ends = np.cumsum([len(k) for k in rows])
+    bounds = np.cumsum([0, *map(len, rows)])
     sampled = [
-        of.take(k[chosen[(chosen >= end - len(k)) & (chosen < end)] - (end - len(k))])
-        for (of, k), end in zip(of_rows, ends, strict=True)
+        of.take(k[chosen[(first <= chosen) & (chosen < end)] - first])
+        for (of, k), (first, end) in zip(of_rows, pairwise(bounds), strict=True)
     ]
-    of_sensor = rows_with(rejects, "sensor_id", sensor)
-    counts = of_sensor.group_by("reason").aggregate([("count", "sum")])
     return SensorLog(
         time_ns,
         number,
         concat(EXPOSURES, sampled),
         concat(LOG_STATES, [of.take(_rows_of(of, sensor, between_ns)) for of in states]),
         rows_with(cameras, "sensor_id", sensor),
-        {row["reason"]: row["count_sum"] for row in counts.to_pylist()},
+        by_reason(rows_with(rejects, "sensor_id", sensor)),
     )
 
 

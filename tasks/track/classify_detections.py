@@ -7,12 +7,12 @@ from scipy.spatial import cKDTree
 from epipole.schemas.arrays import Array, Flags, Integers
 from epipole.schemas.bridge import array
 from epipole.tasks.algorithms.constants import ARCSEC, SECOND_NS
-from epipole.tasks.algorithms.geometry.camera import Camera, row_offset_s, unproject
+from epipole.tasks.algorithms.geometry.camera import Camera, unproject
 from epipole.tasks.algorithms.geometry.directions import matrix_from_quaternion
 from epipole.tasks.algorithms.geometry.turning import angular_rates, turned
 from epipole.tasks.algorithms.orbits.planets import planet_directions
 from epipole.tasks.algorithms.tracking.hot_pixels import FixedPositions, fixed_positions
-from epipole.tasks.common.sightings import Frames, Sightings, camera_of
+from epipole.tasks.common.sightings import Frames, Sightings, camera_of, row_offsets_s
 
 GATE_SIGMA = 4.0  # largest distance of a detection from a known hot pixel, planet or star
 
@@ -88,11 +88,11 @@ def star_directions(frames: Frames, stars: pa.Table, cameras: pa.Table) -> Array
     known = frames.number[frame] == number
     x_px, y_px, frame = array(stars, "x_px")[known], array(stars, "y_px")[known], frame[known]
     R = matrix_from_quaternion(frames.q_sensor_from_icrs)
-    u, row_s = np.empty((len(frame), 3)), np.zeros(len(frame))
-    for row in np.unique(frames.camera[frame]).tolist():
-        camera, of = camera_of(cameras, row), frames.camera[frame] == row
-        u[of] = unproject(camera, x_px[of], y_px[of])
-        row_s[of] = row_offset_s(camera, y_px[of])
+    camera, u = frames.camera[frame], np.empty((len(frame), 3))
+    for row in np.unique(camera).tolist():
+        of = camera == row
+        u[of] = unproject(camera_of(cameras, row), x_px[of], y_px[of])
+    row_s = row_offsets_s(cameras, camera, y_px)
     if row_s.any():  # as they were at the times of the frames
         t_s = (frames.time_ns - frames.time_ns[0]) / SECOND_NS
         rates = angular_rates(t_s, R, np.ones(len(t_s), np.bool_))

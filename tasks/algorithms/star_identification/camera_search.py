@@ -102,6 +102,9 @@ class _Trials:
     limit_s: float = math.inf
     cost_s: float = 0.0
 
+    def is_spent(self) -> bool:
+        return self.cost_s > self.limit_s
+
 
 class _Match(NamedTuple):
     """A camera, and the stars of a frame that are matched with it."""
@@ -190,13 +193,13 @@ def _first_match(
     `sides` are the nominal camera with rows that count down and up.
     """
     for block in _blocks(reach):
-        if trials.cost_s > trials.limit_s:
+        if trials.is_spent():
             return None
         ratios = list(block)
         shared = _shared_sky(frame, sides[0], ratios, trials.skies_of)
         for ratio in ratios:
             for side in sides:
-                if trials.cost_s > trials.limit_s:
+                if trials.is_spent():
                     return None
                 found = _try(frame, _scaled(side, ratio), shared, trials)
                 if found is not None:

@@ -188,6 +188,14 @@ def brightest_first(first, flux):
 
 # Centroids that stay at one pixel: hot pixels, where the sky moves over the image.
 
+
+def filled_sigmas(sigma_px: Array) -> Array:
+    """Return stated errors (n,), the median of them where one is missing (NaN); NaN without any."""
+    if not np.isfinite(sigma_px).any():
+        return sigma_px
+    return np.where(np.isnan(sigma_px), np.nanmedian(sigma_px), sigma_px)
+
+
 # Least number of frames, and least share of all frames, with a centroid at a pixel that is static.
 MIN_STATIC_FRAMES, MIN_STATIC_SHARE = 4, 0.3
 

@@ -25,7 +25,11 @@ from typing import NamedTuple
 import numpy as np
 
 from epipole.schemas.arrays import Array, Indices
-from epipole.tasks.algorithms.star_identification.centroids import RawCentroids, Solutions
+from epipole.tasks.algorithms.star_identification.centroids import (
+    RawCentroids,
+    Solutions,
+    filled_sigmas,
+)
 from epipole.tasks.algorithms.star_identification.frame import MatchSettings, Solution
 from epipole.tasks.algorithms.star_identification.moving_groups import moving_groups
 from epipole.tasks.algorithms.star_identification.reidentify_poor_frames import (
@@ -171,11 +175,8 @@ def identify_sensor(
 
 def _fill_sigmas(centroids: RawCentroids) -> tuple[RawCentroids, bool]:
     """Return the centroids with the median for missing sigmas, and whether any sigma is stated."""
-    sigma_px = centroids.sigma_px
-    if not np.isfinite(sigma_px).any():
-        return centroids, False
-    middle = float(np.nanmedian(sigma_px))
-    return centroids._replace(sigma_px=np.where(np.isnan(sigma_px), middle, sigma_px)), True
+    sigma_px = filled_sigmas(centroids.sigma_px)
+    return centroids._replace(sigma_px=sigma_px), bool(np.isfinite(sigma_px).any())
 
 
 def _open_status(status: Statuses, solutions: Solutions) -> Statuses:

@@ -134,6 +134,14 @@ def test_a_view_without_an_attitude_is_an_error(attitude):
         api.view_frame([1.0], [1.0], camera=CAMERA, attitude_xyzw=attitude, sigma_px=0.1, **where)
 
 
+def test_a_view_needs_a_velocity():
+    with pytest.raises(ValueError, match="velocity_km_s"):
+        api.view_frame(
+            [1.0], [1.0], camera=CAMERA, attitude_xyzw=[0.0, 0.0, 0.0, 1.0], sigma_px=0.1,
+            position_km=[7000.0, 0.0, 0.0], velocity_km_s=None,
+        )  # fmt: skip
+
+
 def test_directions_come_back_with_the_scatter_of_their_covariance():
     rng = np.random.default_rng(5)
     q = np.array([0.3, -0.2, 0.5, 0.78])
