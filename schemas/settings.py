@@ -460,6 +460,11 @@ class WorkSettings(Group):
         description="Memory that a task of `solve` takes at most, about [MiB]. Nights of many "
         "sensors are divided into more tasks; the objects stay the same.",
     )
+    keep: bool = Field(
+        False,
+        description="Whether the tables of the work of a night are kept: a run of the same night "
+        "with more logs then makes only what they change. They take 0.7 kB per detection.",
+    )
 
     @property
     def max_views(self) -> int:
@@ -529,7 +534,7 @@ class Settings(Group):
 
     def key(self) -> str:
         """Return a digest of the settings that results depend on."""
-        text = self.model_dump_json(exclude={"report"})
+        text = self.model_dump_json(exclude={"report": True, "work": {"keep"}})
         return hashlib.sha256(text.encode()).hexdigest()[:16]
 
 

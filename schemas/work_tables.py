@@ -150,7 +150,7 @@ SOLUTIONS = schema(
             "from stars: of what is independent in each frame; the sigmas include the optics.",
         ),
         USED_SIGMA,
-        column("camera", I64, doc="Row of `cameras` that is valid for the frame."),
+        column("camera", I64, doc="Row of the sensor's `cameras` that is valid for the frame."),
         column(
             "zero_mag",
             F64,
@@ -302,16 +302,27 @@ SENSOR_EPOCHS = schema(
         *[column(f"q{a}", F64, frame="sensor from ICRS", doc="Attitude.") for a in "xyzw"],
         *axes("{}_km", unit="km", frame="GCRF", doc="Position"),
         *axes("v{}_km_s", unit="km/s", frame="GCRF", null=True, doc="Velocity"),
-        column("camera", I64, doc="Row of `cameras` that is valid for the frame."),
+        column("camera", I64, doc="Row of the sensor's `cameras` that is valid for the frame."),
+    ],
+)
+
+TRACKLET_ENDS = schema(
+    "tracklet_ends",
+    "One row per tracklet of one sensor near a span: its ids, and its ends as far as they are near "
+    "the span.",
+    [
+        *(field for field in TRACKLET_FIELDS if field.name in ("tracklet_id", "track_id")),
+        time_column("start_time", doc="First detection, or where its rows begin, UTC."),
+        time_column("end_time", doc="Last detection, or where its rows end, UTC."),
     ],
 )
 
 VIEWED_TRACKLETS = schema(
     "viewed_tracklets",
-    "One row per tracklet of one sensor with views in a span: a row of `tracklet_runs`, and where "
+    "One row per tracklet of one sensor with views in a span: a row of `tracklet_ends`, and where "
     "its views are.",
     [
-        *TRACKLET_FIELDS,
+        *TRACKLET_ENDS,
         column("first_view", I64, doc="Its first row in the sensor's views, sorted by tracklet."),
         column("n_views", I64, doc="Number of its views."),
     ],

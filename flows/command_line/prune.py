@@ -1,4 +1,4 @@
-"""`epipole prune`: old nights, reports and unfinished work of a dataset."""
+"""`epipole prune`: old nights, reports and work of a dataset."""
 
 from typing import Annotated
 
@@ -20,7 +20,7 @@ def prune(
         str | None, typer.Option("--reports", metavar="DATE", help="Reports before this date.")
     ] = None,
     work: Annotated[
-        bool, typer.Option("--work", help="The unfinished work of stopped runs.")
+        bool, typer.Option("--work", help="The work of stopped runs, and work that is kept.")
     ] = False,
     yes: Annotated[bool, typer.Option("--yes", help="Remove them; else they are shown.")] = False,
     as_json: AsJson = False,
@@ -44,10 +44,11 @@ def prune(
         if (nights is not None and _date(name) < nights)
         or (reports is not None and name.startswith("reports/") and _date(name) < reports)
     }
-    left = clear_unfinished(dataset) if work and yes else unfinished_work(dataset) if work else []
+    look = clear_unfinished if yes else unfinished_work
+    left = look(dataset, kept=True) if work else []
     if yes:
         remove(dataset, list(chosen))
-    of_work = {f"unfinished work of {each.night}": each.size for each in left}
+    of_work = {f"work of {each.night}": each.size for each in left}
     if as_json:
         print_json({"removed": yes, "bytes": {**chosen, **of_work}})
         return

@@ -64,6 +64,7 @@ class Work(NamedTuple):
         """Return where the parts of each sensor lie in this round."""
         return {
             sensor: SensorParts(
+                sensor.sensor_id,
                 self.identified[sensor],
                 self.folder.tracked(sensor, self.round),
                 self.folder.tracklet_names(sensor, self.round),

@@ -8,13 +8,14 @@ import contextlib
 import os
 import shutil
 import uuid
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Final, NamedTuple
 
 import pyarrow as pa
 import pyarrow.ipc as ipc
 
+from epipole.io.work.kept_parts import KEY, one_key, take_part
 from epipole.schemas.bridge import concat
 from epipole.schemas.errors import DatasetError
 from epipole.schemas.spans import Span, spans_between
@@ -138,6 +139,7 @@ def write_part(
     declared: PartTables,
     tables: Mapping[str, pa.Table],
     within: Path | None = None,
+    key: str | None = None,
 ) -> None:
     """Write the tables of a part, all of them or none. A part that exists stays unchanged.
 
@@ -148,6 +150,8 @@ def write_part(
     within
         A folder of the part that must exist. It is not made: a task that outlives its run would
         bring the run's folder back.
+    key
+        That of `part_key`, by which a later run may find it; None: it is made in every run.
 
     Raises
     ------
@@ -168,6 +172,8 @@ def write_part(
                 ipc.new_file(file, rows.schema) as writer,
             ):
                 writer.write_table(rows)
+        if key is not None:
+            (making / KEY).write_text(key)
         with contextlib.suppress(OSError):  # another worker was first, with the same rows
             making.rename(part)
         if not part.is_dir():
@@ -205,9 +211,13 @@ def read_part(part: Path, name: str, columns: Sequence[str] | None = None) -> pa
 
 
 class Parts(NamedTuple):
-    """The parts of one stage, one per span: of one sensor, or of all sensors together."""
+    """The parts of one stage, one per span: of one sensor, or of all sensors together.
+
+    `kept` is the folder of the parts of earlier runs, by key; None: there are none.
+    """
 
     folder: Path
+    kept: Path | None = None
 
     def of(self, span: Span) -> Path:
         """Return the part of a span."""
@@ -224,6 +234,14 @@ class Parts(NamedTuple):
     def holds(self, span: Span) -> bool:
         """Return whether the span's part exists."""
         return is_written(self.of(span))
+
+    def take(self, span: Span, key: str | None) -> bool:
+        """Return whether the span's part could be taken from those kept; see `take_part`."""
+        return take_part(self.of(span), self.kept, key)
+
+    def keys(self, spans: Iterable[Span]) -> str | None:
+        """Return one key of the parts of these spans; None where one of them has no key."""
+        return one_key(self.of(span) for span in spans if self.holds(span))
 
     def rows_within(self, span: Span, schema: pa.Schema, name: str, time: str = "time") -> pa.Table:
         """Return a table's rows whose time lies in a span, from all parts that may have some.

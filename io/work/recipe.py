@@ -23,6 +23,11 @@ class Recipe(NamedTuple):
     code: str
     known: str | None = None  # the catalogue of known objects
 
+    @property
+    def made_with(self) -> str:
+        """A digest of what the parts of any logs depend on."""
+        return digest_of((self.settings, self.star_catalogue, self.code))[:16]
+
     def work_key(self, night: str) -> str:
         """Return a digest of all that the parts of a night depend on; names are given later."""
         return digest_of((self.logs, self.settings, night, self.star_catalogue, self.code))[:16]

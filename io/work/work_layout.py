@@ -50,18 +50,20 @@ class WorkFolder(NamedTuple):
     """Where the stages after reading put their parts.
 
     A round is one pass from `track` to `check`. After a correction of clocks comes another round.
+    `kept` is the folder of the parts of other runs, by key; None: there are none.
     """
 
     root: Path
+    kept: Path | None = None
 
     def identified(self, sensor: Sensor) -> Parts:
         """Return the parts of `identify`: `IDENTIFIED`."""
-        return Parts(self.root / Stage.IDENTIFY / str(sensor.number))
+        return Parts(self.root / Stage.IDENTIFY / str(sensor.number), self.kept)
 
     def identified_again(self, sensor: Sensor, calibration: int) -> Parts:
         """Return the parts identified with the optics of a calibration, from 1, or with a camera
         that was searched for (0): `IDENTIFIED`."""
-        return Parts(self.root / Stage.CALIBRATE / str(calibration) / str(sensor.number))
+        return Parts(self.root / Stage.CALIBRATE / str(calibration) / str(sensor.number), self.kept)
 
     def corrected(self, sensor: Sensor, round_: int) -> Parts:
         """Return the parts with frames at their true times: `IDENTIFIED`."""
@@ -69,7 +71,7 @@ class WorkFolder(NamedTuple):
 
     def tracked(self, sensor: Sensor, round_: int) -> Parts:
         """Return the parts of `track`: `TRACKED`, with the tracklets' names in the span."""
-        return Parts(self.root / Stage.TRACK / str(round_) / str(sensor.number))
+        return Parts(self.root / Stage.TRACK / str(round_) / str(sensor.number), self.kept)
 
     def tracklet_names(self, sensor: Sensor, round_: int) -> Parts:
         """Return the parts with names in the night: `SPAN_NAMES`, and `NIGHT_TRACKLETS`."""
@@ -77,7 +79,7 @@ class WorkFolder(NamedTuple):
 
     def viewed(self, round_: int) -> "ViewedParts":
         """Return the parts with the views of all sensors."""
-        return ViewedParts(self.root / Stage.SOLVE / str(round_) / "views")
+        return ViewedParts(self.root / Stage.SOLVE / str(round_) / "views", self.kept)
 
     def solved(self, round_: int, all_sensors: bool = True, more_km: float = 0.0) -> "SolvedParts":
         """Return the parts of `solve`: of all sensors, or without those left out.
@@ -85,7 +87,7 @@ class WorkFolder(NamedTuple):
         `more_km` is that of the parts.
         """
         which = ("all" if all_sensors else "some") + (f"-{more_km:g}-km" if more_km else "")
-        return SolvedParts(self.root / Stage.SOLVE / str(round_) / which, more_km)
+        return SolvedParts(self.root / Stage.SOLVE / str(round_) / which, more_km, self.kept)
 
 
 @dataclass(frozen=True)
@@ -93,10 +95,11 @@ class ViewedParts:
     """The views of sensors, by their numbers in the run: `VIEWED`."""
 
     root: Path
+    kept: Path | None = None
 
     def __getitem__(self, number: int) -> Parts:
         """Return the parts of a sensor."""
-        return Parts(self.root / str(number))
+        return Parts(self.root / str(number), self.kept)
 
 
 class SolvedParts(NamedTuple):
@@ -107,11 +110,12 @@ class SolvedParts(NamedTuple):
 
     root: Path
     more_km: float = 0.0
+    kept: Path | None = None  # the folder of the parts of other runs, by key
 
     @property
     def blocks(self) -> Parts:
         """The objects of each block of time: `ASSOCIATED`."""
-        return Parts(self.root / "blocks")
+        return Parts(self.root / "blocks", self.kept)
 
     @property
     def objects(self) -> Parts:
@@ -121,7 +125,7 @@ class SolvedParts(NamedTuple):
     @property
     def errors(self) -> Parts:
         """The sensors of each span whose shared errors are larger than stated: `JUDGED`."""
-        return Parts(self.root / "errors")
+        return Parts(self.root / "errors", self.kept)
 
     def piece(self, span: Span, piece: int) -> Path:
         """Return the part of some objects of a span: `SOLVED`."""
@@ -149,6 +153,7 @@ class SolvedParts(NamedTuple):
 class SensorParts(NamedTuple):
     """The parts of one sensor that the later stages read."""
 
+    sensor_id: str
     identified: Parts
     tracked: Parts
     names: Parts

@@ -10,12 +10,11 @@ import pyarrow.compute as pc
 
 from epipole.io.work.work_layout import SensorParts
 from epipole.schemas.arrays import Array, Flags, Indices, Integers
-from epipole.schemas.bridge import array, concat, stack, stack_covariance, table
+from epipole.schemas.bridge import array, concat, rows_with, stack, stack_covariance
 from epipole.schemas.columns import OPTICS_AXES
 from epipole.schemas.settings import TrackletSettings
 from epipole.schemas.spans import Span, spans_between
 from epipole.schemas.tables import DETECTIONS
-from epipole.schemas.work_tables import TRACKLET_RUNS
 from epipole.tasks.algorithms.constants import ARCSEC, SECOND_NS
 from epipole.tasks.algorithms.geometry.camera import Camera, row_offset_s, unproject
 from epipole.tasks.algorithms.geometry.covariances import attitude_covariance, centroid_covariance
@@ -172,6 +171,11 @@ def part_of(sightings: Sightings, kept: Flags) -> Sightings:
     )
 
 
+def cameras_of(cameras: pa.Table, sensor_id: str) -> pa.Table:
+    """Return the CAMERAS of a sensor, in order of time. The column `camera` counts these rows."""
+    return rows_with(cameras, "sensor_id", sensor_id)
+
+
 def camera_of(cameras: pa.Table, row: int) -> Camera:
     """Return the camera in a row of `cameras`."""
     # Not the time: a Python datetime has no nanoseconds.
@@ -208,32 +212,6 @@ def with_lone_detections(detections: pa.Table, lone: Flags) -> pa.Table:
         names[row] = f"{MARK}{sensor[row]}-{frame[row]}-{centroid[row]}"
     at = detections.schema.get_field_index("tracklet_id")
     return detections.set_column(at, detections.schema.field(at), pa.array(names, pa.string()))
-
-
-def with_lone_tracklets(tracklets: pa.Table, views: pa.Table) -> pa.Table:
-    """Return the tracklets that have views, and a row for each lone detection that has views."""
-    tracklets = tracklets.filter(pc.is_in(tracklets["tracklet_id"], views["tracklet_id"]))
-    lone = views.filter(is_lone(views["tracklet_id"]))
-    if not lone.num_rows:
-        return tracklets
-    names, first = np.unique(array(lone, "tracklet_id").astype(str), return_index=True)
-    lone = lone.take(first)
-    n = lone.num_rows
-    rows = table(
-        TRACKLET_RUNS,
-        {
-            "tracklet_id": names,
-            "track_id": names,
-            "sensor_id": lone["sensor_id"],
-            "start_time": lone["epoch"],
-            "end_time": lone["epoch"],
-            "n_detections": np.ones(n, np.int32),
-            "rate_arcsec_s": np.zeros(n),
-            "residual_px": np.zeros(n),
-            "link_chi2": pa.nulls(n, pa.float64()),
-        },
-    )
-    return concat(TRACKLET_RUNS, [tracklets, rows])
 
 
 def with_lone_objects(detections: pa.Table, associations: pa.Table) -> pa.Table:

@@ -3,19 +3,22 @@
 import logging
 from typing import NamedTuple
 
+import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 
 from epipole.io.catalogues.star_catalogue import read_star_catalogue
+from epipole.io.work.kept_parts import part_key
 from epipole.io.work.parts import IDENTIFIED, Parts, write_part
 from epipole.io.work.work_layout import ReadFolder
-from epipole.schemas.bridge import concat
+from epipole.schemas.bridge import array, concat
 from epipole.schemas.rejects import Reason, reject_rows
 from epipole.schemas.settings import IdentificationSettings, SensorSettings
 from epipole.schemas.spans import Sensor, Span
 from epipole.schemas.stages import Stage
 from epipole.schemas.tables import REJECTS
 from epipole.tasks.common.batches import Batch
+from epipole.tasks.common.sightings import cameras_of
 from epipole.tasks.common.stage_tasks import stage_task
 from epipole.tasks.identify.frame_inputs import interpolate_sensor_states
 from epipole.tasks.identify.identify_stars import identify_stars
@@ -64,7 +67,14 @@ def identify_spans(
         Where `order_sensors` put the frames.
     """
     counts = [
-        _identify_span(frames, *each, cameras, sensors, identification, max_detections)
+        _identify_span(
+            frames,
+            *each,
+            cameras_of(cameras, each.sensor.sensor_id),
+            sensors,
+            identification,
+            max_detections,
+        )
         for each in spans
     ]
     total = Counts(*(sum(count) for count in zip(*counts, strict=True)))
@@ -85,14 +95,26 @@ def _identify_span(
     if not parts.holds(span):
         exposures = frames_between(frames, sensor.number, *span)
         states = states_about(frames, sensor, span, sensors.state_gap_s)
+        cameras = valid_cameras(cameras, exposures)
+        key = part_key([Stage.IDENTIFY, span, sensor.has_velocities], [exposures, states, cameras])
+        if parts.take(span, key):
+            return _counts(parts, span)
         frame_states = interpolate_sensor_states(exposures, states, sensors)
         catalogue = read_star_catalogue(identification.catalogue)
         identified = identify_stars(
             exposures, frame_states, cameras, catalogue, sensors, identification, max_detections
         )
         rejects = concat(REJECTS, [identified.rejects, _without_state(frame_states)])
-        write_part(parts.of(span), IDENTIFIED, {**identified._asdict(), "rejects": rejects})
+        tables = {**identified._asdict(), "rejects": rejects}
+        write_part(parts.of(span), IDENTIFIED, tables, key=key)
     return _counts(parts, span)
+
+
+def valid_cameras(cameras: pa.Table, exposures: pa.Table) -> pa.Table:
+    """Return the CAMERAS of a sensor without those that are newer than all of these frames."""
+    last_ns = array(exposures, "time").max()
+    count = int(np.searchsorted(array(cameras, "time"), last_ns, side="right"))
+    return cameras.slice(0, max(count, 1))  # the first one also counts before its time
 
 
 def _counts(parts: Parts, span: Span) -> Counts:

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
+import polars as pl
 import pyarrow as pa
 import pyarrow.compute as pc
 
@@ -19,7 +20,16 @@ from epipole.io.logs.left_out import frames_left_out, stray_rejects
 from epipole.io.work.parts import READ_SENSOR, read_part, write_part
 from epipole.io.work.work_layout import ReadFolder
 from epipole.schemas.arrays import Indices
-from epipole.schemas.bridge import array, concat, conform, rows_with, table, unstack_covariance
+from epipole.schemas.bridge import (
+    array,
+    concat,
+    conform,
+    from_polars,
+    rows_with,
+    table,
+    to_polars,
+    unstack_covariance,
+)
 from epipole.schemas.columns import OPTICS_AXES
 from epipole.schemas.rejects import Reason, reject_rows
 from epipole.schemas.settings import SensorSettings
@@ -345,9 +355,13 @@ def _sorted_states(
 
 
 def _sorted_cameras(cameras: pa.Table) -> pa.Table:
-    """Return the calibrations sorted by sensor and time; equal rows count once."""
-    unique = cameras.group_by(CAMERAS.names, use_threads=False).aggregate([])
-    return conform(CAMERAS, unique.sort_by([(name, "ascending") for name in CAMERAS.names]))
+    """Return the calibrations sorted by sensor and time, without those that repeat the one before.
+
+    Each log of a sensor states its calibration again.
+    """
+    rows = to_polars(cameras.sort_by([(name, "ascending") for name in CAMERAS.names]))
+    run = pl.struct(pl.exclude("time")).rle_id()
+    return from_polars(CAMERAS, rows.filter(run.is_first_distinct()))
 
 
 def with_uncertain_principal_points(cameras: pa.Table, sigma_px: float) -> pa.Table:

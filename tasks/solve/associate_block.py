@@ -14,6 +14,7 @@ import polars as pl
 import pyarrow as pa
 import pyarrow.compute as pc
 
+from epipole.io.work.kept_parts import one_key, part_key
 from epipole.io.work.parts import ASSOCIATED, Parts, write_part
 from epipole.io.work.work_layout import ViewedParts
 from epipole.schemas.bridge import array, concat, empty, from_polars, table, to_polars
@@ -102,11 +103,14 @@ def associate_blocks(
         Error that is added to the positions of all sensors, 1-sigma per axis.
     """
     for block in blocks:
-        if not parts.holds(block):
+        seeing = [sensor for sensor in sensors if viewed[sensor.number].holds(block.span)]
+        read = one_key(viewed[sensor.number].of(block.span) for sensor in seeing)
+        made_from = [Stage.SOLVE, block, seeing, left_out, more_km, read]
+        key = None if read is None else part_key(made_from)
+        if not parts.holds(block) and not parts.take(block, key):
             views = [
                 sensor_views(sensor, viewed[sensor.number], block.span, more_km)
-                for sensor in sensors
-                if viewed[sensor.number].holds(block.span)
+                for sensor in seeing
             ]
             taking_part = [
                 sensor
@@ -120,7 +124,8 @@ def associate_blocks(
                 )
             tables = _associate(block_views, settings, max_views)
             faulty = [sensor for sensor in views if sensor.sensor_id in left_out]
-            write_part(parts.of(block), ASSOCIATED, _with_faulty(tables, faulty, block, left_out))
+            tables = _with_faulty(tables, faulty, block, left_out)
+            write_part(parts.of(block), ASSOCIATED, tables, key=key)
 
 
 def blocks_of(span: Span, settings: AssociationSettings) -> list[Span]:

@@ -24,7 +24,7 @@ from epipole.tasks.algorithms.association.samples import Samples
 from epipole.tasks.algorithms.association.window_groups import Items
 from epipole.tasks.algorithms.geometry.directions import matrix_from_quaternion
 from epipole.tasks.common.grouping import group_offsets
-from epipole.tasks.common.sightings import camera_of
+from epipole.tasks.common.sightings import camera_of, cameras_of
 
 # Instants.
 
@@ -115,13 +115,15 @@ class SensorPoses:
     ----------
     epochs
         SENSOR_EPOCHS of each sensor, in order of time.
+    cameras
+        CAMERAS of each sensor.
     """
 
-    def __init__(self, epochs: Sequence[pa.Table], cameras: pa.Table) -> None:
+    def __init__(self, epochs: Sequence[pa.Table], cameras: Sequence[pa.Table]) -> None:
         self._frames = [_near_frames(rows) for rows in epochs]
         half_field, focal_px = [], []
-        for rows in epochs:
-            camera = camera_of(cameras, int(array(rows, "camera")[0]) if rows.num_rows else 0)
+        for rows, of_sensor in zip(epochs, cameras, strict=True):
+            camera = camera_of(of_sensor, int(array(rows, "camera")[0]) if rows.num_rows else 0)
             half_field.append(
                 (camera.width / camera.fx_px / 2, camera.height / abs(camera.fy_px) / 2)
             )
@@ -208,6 +210,8 @@ class BlockViews:
     ----------
     sensors
         In the order of their ids.
+    cameras
+        CAMERAS of all of them.
     block
         Views at other epochs are left out.
     window_s, half_width_s
@@ -239,7 +243,10 @@ class BlockViews:
         self.end_ns = array(self.tracklets, "end_time")
         self.origin_ns = block.start_ns
         self.window_ns = max(round(window_s * 1e9), 1)
-        self.poses = SensorPoses([one.epochs for one in sensors], cameras)
+        self.poses = SensorPoses(
+            [one.epochs for one in sensors],
+            [cameras_of(cameras, one.sensor_id) for one in sensors],
+        )
         self._tracklet_row = np.argsort(order, kind="stable")  # of tracklets, sensor by sensor
         self._read(block)
         self._choose_instants()

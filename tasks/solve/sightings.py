@@ -410,22 +410,25 @@ def _bias_sigma(sightings: SensorSightings, rows: Indices) -> Array:
     return np.sqrt(np.maximum(trace / 2, 0.0))
 
 
-def tabulate_attributables(
-    sightings: SensorSightings | None, tracklets: pa.Table, span: Span
-) -> pa.Table:
-    """Return ATTRIBUTABLES of one sensor's tracklets whose middle is in a span.
+def with_middle_in(tracklets: pa.Table, span: Span) -> pa.Table:
+    """Return the tracklets whose middle is in a span."""
+    middle = (array(tracklets, "start_time") + array(tracklets, "end_time")) // 2
+    return tracklets.filter(pa.array(span.holds(middle)))
+
+
+def tabulate_attributables(sightings: SensorSightings | None, tracklets: pa.Table) -> pa.Table:
+    """Return ATTRIBUTABLES of one sensor's tracklets.
 
     Parameters
     ----------
     tracklets
-        TRACKLET_RUNS of the sensor.
+        Those with a middle in the span: ids and ends.
     """
-    middle = (array(tracklets, "start_time") + array(tracklets, "end_time")) // 2
-    inside = (middle >= span.start_ns) & (middle < span.end_ns)
-    if sightings is None or not inside.any():
+    if sightings is None or not tracklets.num_rows:
         return empty(ATTRIBUTABLES)
     frames, grouped = sightings.frames, sightings.tracklets
-    names, middle = array(tracklets, "tracklet_id")[inside], middle[inside]
+    names = array(tracklets, "tracklet_id")
+    middle = (array(tracklets, "start_time") + array(tracklets, "end_time")) // 2
     by_name = {name: row for row, name in enumerate(grouped.name)}
     number = np.array([by_name.get(name, -1) for name in names], np.int64)
     names, middle, number = names[number >= 0], middle[number >= 0], number[number >= 0]

@@ -4,13 +4,16 @@ Margins before and after the span are solved too: the velocities at its first an
 positions on both sides. Rows of the margins are not kept: they belong to the neighbouring spans.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 import polars as pl
 import pyarrow as pa
+import pyarrow.compute as pc
 
+from epipole.io.work.kept_parts import part_key, take_part
 from epipole.io.work.parts import JUDGED, SOLVED, is_written, read_part, write_part
 from epipole.io.work.work_layout import SolvedParts, ViewedParts
 from epipole.schemas.arrays import Indices
@@ -167,19 +170,39 @@ def solve_piece(
         Number of positions.
     """
     part = solved.piece(piece.span, piece.number)
-    if not is_written(part):
-        members = solved.objects.read(piece.span, "members")
-        members = members.filter(pa.compute.field("piece") == piece.number)
-        time = piece.span.widened(margin_ns)
+    if is_written(part):
+        return _n_positions(part)
+    members = solved.objects.read(piece.span, "members")
+    members = members.filter(pa.compute.field("piece") == piece.number)
+    time = piece.span.widened(margin_ns)
+    errors = solved.errors.read(piece.span, "errors")
+    made_from = ["positions", piece, margin_ns, sampling, solved.more_km]
+    key = _key(viewed, time, made_from, [members, errors])
+    if not take_part(part, solved.kept, key):
         views = unpack_views(*gather_views(viewed, members, time, more_km=solved.more_km))
-        errors = solved.errors.read(piece.span, "errors")
         groups = solve_positions(
             with_larger_errors(views, errors), positions.reject_sigma, piece.span
         )
         stated = with_stated_errors(groups.views, errors, solved.more_km)
         tables = _tables(groups, stated, sampling, positions.all_pairs, states)
-        write_part(part, SOLVED, tables)
+        write_part(part, SOLVED, tables, key=key)
+    return _n_positions(part)
+
+
+def _n_positions(part: Path) -> int:
     return read_part(part, "positions").num_rows
+
+
+def _key(
+    viewed: ViewedParts, time: Span, made_from: Sequence[object], rows: Sequence[pa.Table]
+) -> str | None:
+    """Return the key of a part that is made from the views of objects within a time.
+
+    `rows` begin with the OBJECT_MEMBERS of the objects.
+    """
+    numbers = sorted(pc.unique(rows[0]["sensor"]).to_pylist())
+    read = [viewed[number].keys(spans_between(*time)) for number in numbers]
+    return None if None in read else part_key([Stage.SOLVE, time, *made_from, *read], rows)
 
 
 def _tables(
@@ -237,12 +260,16 @@ def judge_span(
         return
     members = sample_objects(solved.objects.read(span, "members"), max_views)
     time = span.widened(margin_ns)
+    key = _key(viewed, time, ["errors", every_ns, solved.more_km], [members])
+    if solved.errors.take(span, key):
+        return
     gathered = gather_views(viewed, members, time, every_ns, solved.more_km)
     views = unpack_views(*gathered)
     groups = solve_positions(views, positions.reject_sigma, span)
     # Directions as fitted, not corrected: the motion that the fits neglect is in their noise.
     fitted = groups._replace(views=views.take(groups.row))
-    write_part(solved.errors.of(span), JUDGED, {"errors": judge_errors(fitted, states)})
+    tables = {"errors": judge_errors(fitted, states)}
+    write_part(solved.errors.of(span), JUDGED, tables, key=key)
 
 
 def sample_objects(members: pa.Table, max_views: int) -> pa.Table:

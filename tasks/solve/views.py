@@ -6,16 +6,34 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 import pyarrow as pa
+import pyarrow.compute as pc
 
+from epipole.io.work.kept_parts import part_key
 from epipole.io.work.parts import VIEWED, read_part, write_part
 from epipole.io.work.work_layout import SensorParts
 from epipole.schemas.arrays import Array, Flags, Indices
-from epipole.schemas.bridge import array, empty, nullable, stack, table, unstack, unstack_covariance
+from epipole.schemas.bridge import (
+    array,
+    concat,
+    conform,
+    empty,
+    nullable,
+    stack,
+    table,
+    unstack,
+    unstack_covariance,
+)
 from epipole.schemas.columns import TANGENT_AXES
 from epipole.schemas.settings import AlignmentSettings, TrackletSettings
 from epipole.schemas.spans import Span
 from epipole.schemas.stages import Stage
-from epipole.schemas.work_tables import SENSOR_EPOCHS, SOLUTIONS, VIEWED_TRACKLETS, VIEWS
+from epipole.schemas.work_tables import (
+    SENSOR_EPOCHS,
+    SOLUTIONS,
+    TRACKLET_ENDS,
+    VIEWED_TRACKLETS,
+    VIEWS,
+)
 from epipole.tasks.algorithms.geometry.camera import Camera, project
 from epipole.tasks.algorithms.geometry.covariances import on_tangent_plane
 from epipole.tasks.algorithms.geometry.directions import (
@@ -28,9 +46,10 @@ from epipole.tasks.algorithms.tracking.local_motion import directions_at
 from epipole.tasks.common.grouping import group_offsets
 from epipole.tasks.common.sightings import (
     Frames,
+    cameras_of,
     detections_within,
+    is_lone,
     solved_frames,
-    with_lone_tracklets,
 )
 from epipole.tasks.common.stage_tasks import stage_task
 from epipole.tasks.solve.align_epochs import EpochGrid, align_epochs
@@ -42,6 +61,7 @@ from epipole.tasks.solve.sightings import (
     states_near_frames,
     tabulate_attributables,
     tabulate_sightings,
+    with_middle_in,
 )
 
 # Of an image, per axis. What fitted optics are wrong by changes little within a part. With 1 to 12
@@ -228,35 +248,88 @@ def view_sensors(
     count = 0
     for sensor in sensors:
         if not sensor.viewed.holds(span):
-            tables = _view(sensor, span, grid, cameras, tracklets, alignment)
-            write_part(sensor.viewed.of(span), VIEWED, tables)
+            of_sensor = cameras_of(cameras, sensor.sensor_id)
+            _view_span(sensor, span, grid, of_sensor, tracklets, alignment)
         count += sensor.viewed.read(span, "views").num_rows
     return count
 
 
-def _view(
+def _view_span(
     sensor: SensorParts,
     span: Span,
     grid: EpochGrid,
     cameras: pa.Table,
     tracklets: TrackletSettings,
     alignment: AlignmentSettings,
-) -> dict[str, pa.Table]:
+) -> None:
+    """Write the views of a sensor in a span, or take those that are kept."""
     margin_s = max(2 * alignment.window_s, MAX_HALF_S)
     wide = span.widened(round(1e9 * margin_s) + MIN_FRAMES * grid.interval_ns)
+    of_night = read_part(sensor.names.of_night(), "tracklets", TRACKLET_ENDS.names)
+    named = _Named(tracklets_near(of_night, wide), with_middle_in(of_night, span))
+    key = _key(sensor, span, wide, grid, named)
+    if not sensor.viewed.take(span, key):
+        tables = _view(sensor, span, wide, grid, named, cameras, tracklets, alignment)
+        write_part(sensor.viewed.of(span), VIEWED, tables, key=key)
+
+
+class _Named(NamedTuple):
+    """A sensor's tracklets with their names in the night: those near a span, and those whose middle
+    is in it."""
+
+    near: pa.Table
+    middle_in: pa.Table
+
+
+def tracklets_near(tracklets: pa.Table, wide: Span) -> pa.Table:
+    """Return the tracklets in a time, their ends as far as they are in it.
+
+    So the rows do not depend on how long a tracklet goes on elsewhere in the night.
+    """
+    start_ns, end_ns = array(tracklets, "start_time"), array(tracklets, "end_time")
+    near = np.flatnonzero((end_ns >= wide.start_ns) & (start_ns < wide.end_ns))
+    ids = tracklets.select(["tracklet_id", "track_id"]).take(near)
+    return table(
+        TRACKLET_ENDS,
+        {
+            **{name: ids[name] for name in ids.column_names},
+            "start_time": np.maximum(start_ns[near], wide.start_ns),
+            "end_time": np.minimum(end_ns[near], wide.end_ns),
+        },
+    )
+
+
+def _key(sensor: SensorParts, span: Span, wide: Span, grid: EpochGrid, named: _Named) -> str | None:
+    """Return the key of a sensor's views in a span; `wide` is the time whose rows are read."""
+    read = [part.keys(part.near(wide)) for part in (sensor.identified, sensor.tracked)]
+    if None in read:
+        return None
+    names = [sensor.names.read(near, "names") for near in sensor.names.near(wide)]
+    return part_key([Stage.SOLVE, "views", span, grid, *read], [*named, *names])
+
+
+def _view(
+    sensor: SensorParts,
+    span: Span,
+    wide: Span,
+    grid: EpochGrid,
+    named: _Named,
+    cameras: pa.Table,
+    tracklets: TrackletSettings,
+    alignment: AlignmentSettings,
+) -> dict[str, pa.Table]:
     solutions = sensor.identified.rows_within(wide, SOLUTIONS, "solutions")
     epochs = span.of(align_epochs(solutions, alignment, grid), "epoch")
     half_width_s = alignment.window_s
     detections = detections_within(sensor, wide)
     sightings = sight_objects(solutions, detections, cameras, tracklets, half_width_s)
     views = view_objects(epochs, sightings, tracklets.max_rate_deg_s, half_width_s)
-    named = read_part(sensor.names.of_night(), "tracklets")
     return {
         "epochs": sensor_epochs(epochs, solutions),
         "views": views,
         "sightings": span.of(tabulate_sightings(sightings), "time"),
-        "attributables": tabulate_attributables(sightings, named, span),
-        "tracklets": viewed_tracklets(named, views),
+        "attributables": tabulate_attributables(sightings, named.middle_in),
+        "tracklets": viewed_tracklets(named.near, views),
     }
 
 
@@ -278,7 +351,19 @@ def sensor_epochs(epochs: pa.Table, solutions: pa.Table) -> pa.Table:
 def viewed_tracklets(tracklets: pa.Table, views: pa.Table) -> pa.Table:
     """Return VIEWED_TRACKLETS of one sensor, in the order of the ids, as the views are."""
     bounds = group_offsets(array(views, "tracklet_id"))
-    rows = with_lone_tracklets(tracklets, views.take(bounds[:-1])).sort_by("tracklet_id")
+    rows = _with_lone(tracklets, views.take(bounds[:-1])).sort_by("tracklet_id")
     columns = {name: rows[name] for name in rows.column_names}
     where = {"first_view": bounds[:-1], "n_views": np.diff(bounds)}
     return table(VIEWED_TRACKLETS, columns | where)
+
+
+def _with_lone(tracklets: pa.Table, views: pa.Table) -> pa.Table:
+    """Return the tracklets that have views, and a row for each lone detection that has views."""
+    tracklets = conform(TRACKLET_ENDS, tracklets.select(TRACKLET_ENDS.names))
+    tracklets = tracklets.filter(pc.is_in(tracklets["tracklet_id"], views["tracklet_id"]))
+    lone = views.filter(is_lone(views["tracklet_id"]))
+    _, first = np.unique(array(lone, "tracklet_id").astype(str), return_index=True)
+    lone = lone.take(first)
+    columns = dict.fromkeys(("tracklet_id", "track_id"), lone["tracklet_id"])
+    columns |= dict.fromkeys(("start_time", "end_time"), lone["epoch"])
+    return concat(TRACKLET_ENDS, [tracklets, table(TRACKLET_ENDS, columns)])

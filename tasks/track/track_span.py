@@ -19,6 +19,7 @@ import numpy as np
 import numpy.typing as npt
 import pyarrow as pa
 
+from epipole.io.work.kept_parts import part_key
 from epipole.io.work.parts import TRACKED, Parts, write_part
 from epipole.schemas.arrays import Array, Flags, Integers
 from epipole.schemas.bridge import array, concat, empty, nullable, table
@@ -45,6 +46,7 @@ from epipole.tasks.common.sightings import (
     Frames,
     Sightings,
     camera_of,
+    cameras_of,
     image_sightings_of,
     part_of,
     sightings_of,
@@ -453,7 +455,10 @@ def track_spans(
     list of int
         The number of detections in each part.
     """
-    return [_track_span(each, cameras, settings, half_width_s) for each in spans]
+    return [
+        _track_span(each, cameras_of(cameras, each.sensor.sensor_id), settings, half_width_s)
+        for each in spans
+    ]
 
 
 def _track_span(
@@ -462,6 +467,10 @@ def _track_span(
     _, span, identified, parts = work
     if not parts.holds(span):
         wide = span.widened(track_margin_ns(settings))
+        read = identified.keys(identified.near(wide))
+        key = None if read is None else part_key([Stage.TRACK, span, read])
+        if parts.take(span, key):
+            return _n_detections(parts, span)
         tracked = build_tracklets(
             identified.rows_within(wide, SOLUTIONS, "solutions"),
             identified.rows_within(wide, DETECTIONS, "detections"),
@@ -470,5 +479,9 @@ def _track_span(
             half_width_s,
             identified.rows_within(wide, STARS, "stars"),
         )
-        write_part(parts.of(span), TRACKED, tracked._asdict())
+        write_part(parts.of(span), TRACKED, tracked._asdict(), key=key)
+    return _n_detections(parts, span)
+
+
+def _n_detections(parts: Parts, span: Span) -> int:
     return parts.read(span, "detections", ["time"]).num_rows

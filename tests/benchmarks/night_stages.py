@@ -26,7 +26,12 @@ from epipole.tasks.solve.align_epochs import align_epochs
 from epipole.tasks.solve.associate_block import associate_blocks, blocks_of
 from epipole.tasks.solve.number_objects import number_objects
 from epipole.tasks.solve.positions import solve_positions
-from epipole.tasks.solve.sightings import sight_objects, tabulate_attributables, tabulate_sightings
+from epipole.tasks.solve.sightings import (
+    sight_objects,
+    tabulate_attributables,
+    tabulate_sightings,
+    with_middle_in,
+)
 from epipole.tasks.solve.solve_piece import gather_views
 from epipole.tasks.solve.view_groups import ViewGroups, unpack_views
 from epipole.tasks.solve.views import sensor_epochs, view_objects, viewed_tracklets
@@ -129,7 +134,7 @@ def _view(
             tables = {
                 "views": of_span,
                 "sightings": span.of(sightings, "time"),
-                "attributables": tabulate_attributables(sighted, tracklets, span),
+                "attributables": tabulate_attributables(sighted, with_middle_in(tracklets, span)),
                 "epochs": sensor_epochs(span.of(own, "epoch"), solutions),
                 "tracklets": viewed_tracklets(tracklets, of_span),
             }

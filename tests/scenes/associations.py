@@ -112,9 +112,11 @@ def tables(scene: Scene, names=None) -> SceneTables:
            for ab in ("xx", "xy", "xz", "yy", "yz", "zz")},
         "used_position_sigma_km": np.full(m, 0.02),
     })  # fmt: skip
-    cameras = filled(CAMERAS, 1, {
-        "sensor_id": [names[0]], "time": [START_NS], "width": [WIDTH], "height": [WIDTH],
-        "fx_px": [focal], "fy_px": [focal], "cx_px": [255.5], "cy_px": [255.5],
+    cameras = filled(CAMERAS, n_sensors, {
+        "sensor_id": names, "time": [START_NS] * n_sensors,
+        **{name: [WIDTH] * n_sensors for name in ("width", "height")},
+        **{name: [focal] * n_sensors for name in ("fx_px", "fy_px")},
+        **{name: [255.5] * n_sensors for name in ("cx_px", "cy_px")},
     })  # fmt: skip
     return SceneTables(views, tracklets, solutions, cameras)
 

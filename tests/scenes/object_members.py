@@ -55,8 +55,7 @@ def write_spans(folder: Path, sensors: Sequence[SensorViews]) -> Mapping[int, Pa
         for of in sensors:
             views = span.of(of.read_views(), "epoch")
             if views.num_rows:
-                known = [field.name for field in TRACKLET_RUNS]
-                tracklets = viewed_tracklets(of.tracklets.select(known), views)
+                tracklets = viewed_tracklets(of.tracklets, views)
                 write_views(
                     folder,
                     [of._replace(read_views=partial(pa.Table.slice, views), tracklets=tracklets)],

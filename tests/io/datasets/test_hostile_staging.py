@@ -17,7 +17,9 @@ from epipole.io.datasets.dataset import lock_nights, write_beside
 from epipole.io.datasets.object_store import store_nights
 from epipole.io.datasets.plain_files import MAX_BYTES
 from epipole.io.work.folder import work_folder
+from epipole.io.work.recipe import recipe_of
 from epipole.schemas.errors import DatasetError
+from epipole.schemas.settings import Settings
 
 
 @pytest.fixture
@@ -157,10 +159,12 @@ def test_a_lock_of_odd_content_is_named(change, dataset):
 
 
 def test_a_work_folder_or_reports_that_are_links_are_not_written_to(dataset):
-    (dataset / ".staging" / f"work-{NIGHT}-k").symlink_to(dataset.parent / "secret")
+    recipe = recipe_of("", Settings())
+    name = f"work-{NIGHT}-{recipe.made_with}-{recipe.work_key(NIGHT)}"
+    (dataset / ".staging" / name).symlink_to(dataset.parent / "secret")
     with (
         pytest.raises(DatasetError, match="is a symbolic link; remove it"),
-        work_folder(dataset / ".staging", NIGHT, "k"),
+        work_folder(dataset / ".staging", NIGHT, recipe),
     ):
         pytest.fail("a link")
     (dataset / "reports").symlink_to(dataset.parent / "secret")

@@ -70,7 +70,7 @@ def night(tmp_path, tracks: dict[Sensor, dict[str, str]], suspects=()) -> NightP
         write_part(names_of.of_night(), NIGHT_TRACKLETS, tables)
         sensors.append(
             SensorParts(
-                folder.identified(sensor), folder.tracked(sensor, 0), names_of,
+                sensor.sensor_id, folder.identified(sensor), folder.tracked(sensor, 0), names_of,
                 folder.viewed(0)[sensor.number],
             )
         )  # fmt: skip

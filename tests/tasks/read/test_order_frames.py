@@ -154,10 +154,22 @@ def test_a_sensor_without_calibration_keeps_its_frames(tmp_path):
     assert log.cameras.num_rows == 0
 
 
-def test_calibrations_are_sorted_and_a_repeated_one_counts_once(tmp_path):
+def test_calibrations_are_sorted_and_one_that_repeats_the_one_before_counts_once(tmp_path):
     times = [START_NS + 5, START_NS, START_NS]
     log = read(write(tmp_path / "a.mcap", "s", [(0, 0)], camera_ns=times))
-    assert array(log.cameras, "time").tolist() == [START_NS, START_NS + 5]
+    assert array(log.cameras, "time").tolist() == [START_NS]
+
+
+def test_a_calibration_that_comes_back_counts_again(tmp_path):
+    path = write(tmp_path / "a.mcap", "s", [(0, 0)])
+    with LogWriter(tmp_path / "b.mcap") as log:
+        for k, fx_px in enumerate([500.0, 500.0, 510.0, 510.0, 500.0]):
+            log.camera("s", START_NS + k, CAMERA | {"fx_px": fx_px})
+            log.camera("r", START_NS + k, CAMERA)
+    found = read(path, tmp_path / "b.mcap").cameras
+    assert array(found, "sensor_id").tolist() == ["r", "s", "s", "s"]
+    assert (array(found, "time") - START_NS).tolist() == [0, 0, 2, 4]
+    assert array(found, "fx_px").tolist() == [500.0, 500.0, 510.0, 500.0]
 
 
 def test_states_are_converted_to_gcrf(tmp_path):

@@ -5,15 +5,21 @@ from scenes.associations import START_NS, WIDTH, sensor_views, tables
 from scenes.tracklet_scenes import FIELD, Scene
 
 from epipole.schemas.settings import AlignmentSettings, Settings
+from epipole.tasks.common.sightings import cameras_of
 from epipole.tasks.solve.association_input import SensorPoses
 
 SECOND_NS = 1_000_000_000
 TIMES = np.arange(0.0, 120.0, 2.0)
 
 
+def poses_at(epochs, of) -> SensorPoses:
+    names = sorted(set(of.cameras["sensor_id"].to_pylist()))
+    return SensorPoses(epochs, [cameras_of(of.cameras, name) for name in names])
+
+
 def poses_of(of, **alignment) -> SensorPoses:
     settings = Settings(alignment=AlignmentSettings(**alignment))
-    return SensorPoses([one.epochs for one in sensor_views(of, settings)], of.cameras)
+    return poses_at([one.epochs for one in sensor_views(of, settings)], of)
 
 
 def test_poses_are_those_of_the_frames():
@@ -45,6 +51,6 @@ def test_a_sensor_without_epochs_has_no_pose():
     of = tables(Scene(3, 3, times=TIMES).objects(2))
     epochs = [one.epochs for one in sensor_views(of)]
     epochs[1] = epochs[1].slice(0, 0)
-    here = SensorPoses(epochs, of.cameras).at(START_NS + np.array([10, 100]) * SECOND_NS)
+    here = poses_at(epochs, of).at(START_NS + np.array([10, 100]) * SECOND_NS)
     known = np.isfinite(here.sensor_km).all(axis=(1, 2))
     assert known.tolist() == [True, False, True]

@@ -18,6 +18,7 @@ from epipole.tasks.solve.sightings import (
     sight_objects,
     tabulate_attributables,
     tabulate_sightings,
+    with_middle_in,
 )
 
 T0 = 1_554_091_200_000_000_000
@@ -177,7 +178,7 @@ def attributable(span=HOUR, **scene):
     """The attributables in a span."""
     ends = {"start_time": [T0], "end_time": [T0 + (N - 1) * 1_000_000_000]}
     runs = filled(TRACKLET_RUNS, 1, {"tracklet_id": ["t"], "sensor_id": ["s"], **ends})
-    return tabulate_attributables(sighting(**scene), runs, span)
+    return tabulate_attributables(sighting(**scene), with_middle_in(runs, span))
 
 
 def test_an_attributable_is_at_the_middle_and_has_the_observations_mean():
