@@ -172,10 +172,12 @@ def observed_objects(rows: pl.DataFrame, origin_ns: int, around: Surroundings) -
 def best_orbit(
     directions: ObjectDirections, start: Start | None, origin_ns: int, around: Surroundings
 ) -> FittedOrbit | None:
-    """Return an object's orbit; None where no fit converges.
+    """Return an object's orbit; None where no fit converges, or all directions are of one instant.
 
     Without an initial state, or where no fit from it converges, it comes from the directions.
     """
+    if directions.time_s[0] == directions.time_s[-1]:
+        return None
     found = None
     if start is not None:
         state = turned(state_rotation(around.R_night_from_gcrf), start.state)

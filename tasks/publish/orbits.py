@@ -168,11 +168,16 @@ def initial_states(
 
 
 def _from_positions(rows: pl.DataFrame) -> dict[str, Start]:
-    """Return the initial state of an object by its positions, in order of time."""
+    """Return the initial state of an object by its positions, in order of time.
+
+    Empty if its middle position has no other near in time: it shows no velocity.
+    """
     time_ns, r_km = rows["epoch"].cast(pl.Int64).to_numpy(), rows.select(POSITION).to_numpy()
     ends = np.array([0, len(rows)])
-    v_km_s, _ = velocities(ends, (time_ns - time_ns[0]) / SECOND_NS, r_km, SLOPE_S)
+    v_km_s, spread_s = velocities(ends, (time_ns - time_ns[0]) / SECOND_NS, r_km, SLOPE_S)
     middle = len(rows) // 2
+    if not spread_s[middle]:
+        return {}
     state = np.hstack([r_km, v_km_s])[middle : middle + 1]
     return _starts(rows[middle], state)
 

@@ -44,6 +44,7 @@ MIN_DIRECTIONS = 4
 # 0.7 is 1.0 sigma from it. It moved the 24 orbits of a constellation, whose eccentricities have
 # sigmas of 0.01 and less, by 1e-4 of their sigmas at most.
 VELOCITY_SIGMA = 0.3
+LEAST_KM_S = 1e-9  # least horizontal velocity: directions of one instant show none
 # What the forces neglect, above all the Earth's field of degrees 3 to 6 beside J3 and J4. On eight
 # low orbits these are 1.2e-5 of gravity (EGM96), and move the fit of 10, 45, 90 and 180 minutes by
 # 1, 5, 12 and 32 m per axis. Fits to SGP4, whose theory neglects more, are off by up to four times
@@ -301,7 +302,8 @@ def _velocity_prior(state: Array) -> tuple[Array, Array]:
     up = r_km / distance
     radial = float(up @ v_km_s)
     across = v_km_s - radial * up
-    level = float(np.linalg.norm(across))
+    # Without a horizontal velocity the prior has no direction to pull to.
+    level = max(float(np.linalg.norm(across)), LEAST_KM_S)
     sigma = VELOCITY_SIGMA * np.sqrt(GM_KM3_S2 / distance)
     velocity = np.array([radial, level]) / sigma
     slopes = np.empty((2, 6))

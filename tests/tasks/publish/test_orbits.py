@@ -212,6 +212,23 @@ def test_an_object_without_state_or_position_has_an_orbit_by_its_observations(tm
         assert alone[name] == pytest.approx(started[name], rel=1e-3)
 
 
+def test_an_object_with_a_single_position_has_an_orbit(tmp_path):
+    times_s = np.arange(-5.0, 6.0)
+    written(tmp_path, [observed("a", LOW, times_s=times_s)], [], [positions("a", LOW)[1:2]])
+    rows, _ = made(tmp_path)
+    off = np.array([rows[name][0].as_py() for name in (*POSITION, *VELOCITY)]) - gcrf(LOW)
+    cov = stack_covariance(rows, "cov_{}", STATE_AXES)[0]
+    assert off @ np.linalg.solve(cov, off) < 22.5  # 1 in 1,000 is above
+
+
+def test_directions_of_one_instant_are_no_orbit(tmp_path):
+    seen = observed("a", LOW, times_s=np.zeros(1), n_sensors=5)
+    written(tmp_path, [seen], [], [positions("a", LOW)[1:2]])
+    rows, rejects = made(tmp_path)
+    assert rows.num_rows == 0
+    assert sorted(rejects["reason"].to_pylist()) == ["no_orbit", "no_position"]
+
+
 def completed(folder, shares=1):
     """Return the observations of a night with what its orbits add."""
     made(folder, shares)

@@ -83,6 +83,14 @@ def test_a_night_of_few_passages_converges_from_a_state_of_minutes():
     assert sigma_km[1] < sigma_km[0] / 20
 
 
+def test_an_initial_state_at_rest_is_valid():
+    directions = trial(1, LOW, times_s=np.linspace(-20.0, 20.0, 21))
+    at_rest = np.append(LOW[:3], np.zeros(3))
+    orbit = determine_orbit(directions, at_rest, 0.0, 0.0, FIXED, AROUND)
+    off = orbit.unknowns[:6] - LOW[:6]
+    assert off @ np.linalg.solve(orbit.cov[:6, :6], off) < 22.5  # 1 in 1,000 is above
+
+
 PASSAGES = np.concatenate([c + np.linspace(-15.0, 15.0, 40) for c in (-75.0, 75.0)])
 
 
