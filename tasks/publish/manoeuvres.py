@@ -31,6 +31,10 @@ MIN_PART = 8  # directions on each side of the change
 COARSE = 8  # cuts that are tried at first, evenly among the directions
 INSTANTS = 9  # at which both orbits are compared at first, in the time between the directions
 MEETING_CHI2 = 21.1  # three degrees of freedom: 1 of 10,000 manoeuvres is beyond it
+# Largest 1-sigma error, along any axis, of the distance of both orbits where they meet [km]. Vaguer
+# orbits meet whatever objects they are of: one sensor that follows an object for 20 s leaves 800 km
+# and more, two sensors leave 2 km. Neighbours in a plane are some 50 km apart.
+MEETING_SIGMA_KM = 20.0
 
 
 class Manoeuvre(NamedTuple):
@@ -118,22 +122,31 @@ def _least(value: Callable[[int], float], first: int, last: int) -> int:
 def _meeting(
     before: FittedOrbit, after: FittedOrbit, between_s: Array, around: Surroundings
 ) -> float | None:
-    """Return the time at which two orbits lead to one position; None if they never do."""
+    """Return the time at which two orbits lead to one position.
 
-    def chi2(time_s: float) -> float:
+    None if they never do, or if they are too vague to say so (`MEETING_SIGMA_KM`).
+    """
+
+    def distance(time_s: float) -> tuple[Array, Array]:
+        """Return the distance of both orbits (3,) and its covariance (3, 3) [km]."""
         r_km, cov = [], np.zeros((3, 3))
         for fitted in (before, after):
             state, step = propagate_unknowns(fitted.orbit.unknowns, fitted.epoch_s, time_s, around)
             r_km.append(state[:3])
             cov += (step @ fitted.orbit.cov @ step.T)[:3, :3]
-        apart = r_km[1] - r_km[0]
+        return r_km[1] - r_km[0], cov
+
+    def chi2(time_s: float) -> float:
+        apart, cov = distance(time_s)
         return float(apart @ np.linalg.solve(cov, apart))
 
     tried = np.linspace(float(between_s[0]), float(between_s[1]), INSTANTS)
     near = int(np.argmin([chi2(time_s) for time_s in tried.tolist()]))
     bounds = tried[max(near - 1, 0)], tried[min(near + 1, INSTANTS - 1)]
     best = minimize_scalar(chi2, bounds=bounds, method="bounded")
-    return float(best.x) if best.fun < MEETING_CHI2 else None
+    _, cov = distance(float(best.x))
+    is_vague = np.linalg.eigvalsh(cov)[-1] > MEETING_SIGMA_KM**2
+    return float(best.x) if best.fun < MEETING_CHI2 and not is_vague else None
 
 
 def _of_all(fitted: FittedOrbit, cut: int, n: int) -> FittedOrbit:

@@ -191,6 +191,24 @@ def test_a_change_of_the_orbit_is_found(tmp_path, truth, times_s, at_s, km_s):
     assert (rows["residual_sigma"].is_not_null() == is_after).all()
 
 
+def test_vague_orbits_that_meet_by_their_errors_are_no_change_of_an_orbit(tmp_path):
+    # One sensor follows the one object for 20 s, another one the other object ten minutes later.
+    times_s = np.linspace(-10.0, 10.0, 21)
+    before, after = times_s - 300.0, times_s + 300.0
+    other = LOW + np.array([0.0, 40.0, -30.0, 0.02, 0.0, 0.03, 0.0, 0.0])
+    for seed in range(4):
+        seen = [
+            observed("a", LOW, times_s=before, n_sensors=1, seed=seed),
+            observed("a", other, times_s=after, n_sensors=1, seed=seed + 9).with_columns(
+                sensor_id=pl.lit("s9"), tracklet_id=pl.lit("a-9")
+            ),
+        ]
+        written(tmp_path, seen, [state("a", LOW)])
+        rows, rejects = made(tmp_path)
+        assert rows.num_rows == 0
+        assert "manoeuvre" not in rejects["reason"].to_pylist()
+
+
 def test_two_objects_one_after_the_other_are_no_change_of_an_orbit(tmp_path):
     times_s = np.linspace(-5400.0, 5400.0, 80)
     other = GEO + 60.0 * np.eye(8)[2]
