@@ -29,8 +29,11 @@ class CandidatePairs(NamedTuple):
 
     tracklet, object : (n,) int
         Numbers of the tracklet and of the object; any.
-    u, cov : (n, 3), (n, 2, 2) float
-        Direction without aberration and its covariance on `tangent_basis(u)` [rad^2].
+    u : (n, 3) float
+        Direction without aberration.
+    cov_noise, cov_bias : (n, 2, 2) float
+        Covariance of its error on `tangent_basis(u)` [rad^2]: of the part that is new at each
+        epoch, and of the part that all epochs share.
     r_km, v_sensor_km_s : (n, 3) float
         Position and velocity of the sensor, GCRF.
     sigma_km : (n,) float
@@ -42,7 +45,8 @@ class CandidatePairs(NamedTuple):
     tracklet: Indices
     object: Indices
     u: Array
-    cov: Array
+    cov_noise: Array
+    cov_bias: Array
     r_km: Array
     v_sensor_km_s: Array
     sigma_km: Array
@@ -71,9 +75,10 @@ def search_offset(candidates: CandidatePairs) -> Match | None:
         np.column_stack([candidates.tracklet, candidates.object]), axis=0, return_inverse=True
     )
     which = which.ravel()
-    miss, rate = _misses_and_rates(candidates)
-    along, sigma = _mean_offset(miss, rate, which, len(pairs))
-    aside, sigma_aside = _mean_offset(miss, rate @ QUARTER_TURN, which, len(pairs))
+    residuals = _residuals(candidates)
+    along, sigma = _mean_offset(residuals, which, len(pairs))
+    turned = residuals._replace(rate=residuals.rate @ QUARTER_TURN)
+    aside, sigma_aside = _mean_offset(turned, which, len(pairs))
     passes = (np.abs(aside) < GATE_SIGMA * sigma_aside) & (np.abs(along) < MAX_OFFSET_S)
     false = (np.abs(along) < GATE_SIGMA * sigma) & (np.abs(aside) < MAX_OFFSET_S) & ~passes
     good = np.flatnonzero(passes)
@@ -84,32 +89,53 @@ def search_offset(candidates: CandidatePairs) -> Match | None:
     return Match(best, np.flatnonzero(np.isin(which, chosen)))
 
 
-def _misses_and_rates(m: CandidatePairs) -> tuple[Array, Array]:
-    """Return the residual of each pair, and its derivative by the offset, both (n, 2).
+class _Residuals(NamedTuple):
+    """Residuals of pairs in standard deviations, and what they depend on.
 
-    In standard deviations, and per second.
+    miss, rate : (n, 2) float
+        The residual, and its derivative by the offset [1/s].
+    shared : (n, 2, 2) float
+        Covariance of the part of the residual that all epochs of a pair share; that of the whole
+        is the identity.
     """
+
+    miss: Array
+    rate: Array
+    shared: Array
+
+
+def _residuals(m: CandidatePairs) -> _Residuals:
+    """Return the residual of each pair."""
     away = m.x_km - m.r_km
     reach = np.linalg.norm(away, axis=1)
     basis = tangent_basis(m.u) / reach[:, None, None]
+    # Sensor and object are off in one direction for minutes.
     position_cov = m.cov_km2 + (m.sigma_km**2)[:, None, None] * np.eye(3)
-    cov = m.cov + basis @ position_cov @ np.swapaxes(basis, -1, -2)
-    across = np.linalg.inv(np.linalg.cholesky(cov)) @ basis
+    shared = m.cov_bias + basis @ position_cov @ np.swapaxes(basis, -1, -2)
+    root = np.linalg.inv(np.linalg.cholesky(m.cov_noise + shared))
+    across = root @ basis
     miss = np.einsum("nij,nj->ni", across, -away)
     ahead = np.einsum("ni,ni->n", m.u, away) > 0.5 * reach
     # With a late time stamp an object lags by its motion.
     rate = np.einsum("nij,nj->ni", across, m.v_sensor_km_s - m.v_km_s)
-    return np.where(ahead[:, None], miss, FAR_SIGMA), rate
+    miss = np.where(ahead[:, None], miss, FAR_SIGMA)
+    return _Residuals(miss, rate, root @ shared @ np.swapaxes(root, -1, -2))
 
 
-def _mean_offset(miss: Array, rate: Array, which: Indices, n: int) -> tuple[Array, Array]:
+def _mean_offset(residuals: _Residuals, which: Indices, n: int) -> tuple[Array, Array]:
     """Return the offset [s] at which each tracklet passes its object, and its 1-sigma error [s].
 
-    The weighted mean over the epochs of the pair; large where the object is behind the sensor.
+    The weighted mean over the epochs of the pair; large where the object is behind the sensor. The
+    part of the error that the epochs share does not average out.
     """
-    weight = np.bincount(which, np.sum(rate * rate, axis=1), n)
-    weight = np.maximum(weight, 1e-300)
-    return np.bincount(which, np.sum(rate * miss, axis=1), n) / weight, 1 / np.sqrt(weight)
+    miss, rate, shared = residuals
+    square = np.sum(rate * rate, axis=1)
+    common = np.einsum("ni,nij,nj->n", rate, shared, rate)
+    weight = np.maximum(np.bincount(which, square, n), 1e-300)
+    together = np.bincount(which, np.sqrt(np.maximum(common, 0.0)), n)
+    variance = np.bincount(which, square - common, n) + together**2
+    offset = np.bincount(which, np.sum(rate * miss, axis=1), n) / weight
+    return offset, np.sqrt(np.maximum(variance, 0.0)) / weight
 
 
 def _best_supported(pairs: Indices, offset: Array, sigma: Array, n_false: int) -> float | None:
