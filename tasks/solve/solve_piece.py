@@ -293,13 +293,16 @@ def sample_objects(members: pa.Table, max_views: int) -> pa.Table:
         of_sensor.setdefault(sensor, []).append(object_)
     sees = {o: set(s) for o, s in seen.group_by("object").agg(pl.col("sensor")).iter_rows()}
     chosen: set[int] = set()
+    n_chosen = dict.fromkeys(of_sensor, 0)  # objects of each sensor
     n_views = 0
     for sensor, objects in of_sensor.items():
         for object_ in objects:
-            enough = sum(sensor in sees[one] for one in chosen) >= MIN_OBJECTS
+            enough = n_chosen[sensor] >= MIN_OBJECTS
             if enough or (chosen and n_views + size[object_] > max_views):
                 break
             if object_ not in chosen:
                 chosen.add(object_)
                 n_views += size[object_]
+                for seeing in sees[object_]:
+                    n_chosen[seeing] += 1
     return members.filter(pa.array(np.isin(rows["object"].to_numpy(), sorted(chosen))))

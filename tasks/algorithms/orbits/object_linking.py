@@ -13,6 +13,7 @@ from scipy.special import gammaincinv, gammaln
 
 from epipole.schemas.arrays import Array, Flags, Indices
 from epipole.tasks.algorithms.constants import GM_KM3_S2
+from epipole.tasks.algorithms.earth_gravity import propagate_states
 from epipole.tasks.algorithms.orbits.orbit_fit import trajectory
 
 # Returns the last state of an object after times (m,) [s], (m, 6), with covariances (m, 6, 6).
@@ -25,6 +26,8 @@ GATE_SHARE = 0.9999  # share of true links that pass the chi-square test
 # Minimum density of objects [1/km^3]: that of all tracked objects in low orbit.
 MIN_DENSITY_KM3 = 1e-8
 VELOCITIES_KM3_S3 = 1.0  # volume that their velocities fill, about
+MARGIN_S = 1.0  # of times that are looked up by rounded sums; the gap itself is compared after it
+STEP_S = 60.0  # longest step of objects that are seen at one time: right to some metres
 # Neglected accelerations: of Sun and Moon at geostationary height; of the higher harmonics, as a
 # share of gravity.
 ACCELERATION_KM_S2 = 1e-8
@@ -112,12 +115,16 @@ class _CandidatePairs(NamedTuple):
     """Pairs of an earlier and a later object, and the difference of their motions.
 
     `apart` (p, 6) is the state of the later object minus the propagated state of the earlier one;
-    its velocity is NaN where either is unknown. `cov` (p, 6, 6) is its covariance.
+    its velocity is NaN where either is unknown. `d2` (p,) is its squared Mahalanobis distance, by
+    position alone without a velocity. `near` (q,) are the rows of which this passes the chi-square
+    test, `cov` (q, 6, 6) their covariances: those of all pairs would fill the memory.
     """
 
     earlier: Indices
     later: Indices
     apart: Array
+    d2: Array
+    near: Indices
     cov: Array
 
 
@@ -128,15 +135,13 @@ def _pairs(
     moved: Mover | None = None,
 ) -> _CandidatePairs:
     """Return the pairs that may be one object, by time and energy, with their differences."""
-    gap = motions.first_s - motions.last_s[:, None]
-    in_time = (gap > 0.0) & (gap <= gap_s)
-    if allowed is not None:
-        in_time &= allowed
+    may_be = _PossiblePairs(motions, gap_s, allowed)
     moving, moves = np.isfinite(motions.tail[:, 3]), np.isfinite(motions.head[:, 3])
-    kept = in_time & _energies_agree(motions)
     parts = []
     for i in np.flatnonzero(moving):  # forward, from each earlier object
-        later = np.flatnonzero(kept[i])
+        later = may_be.later(int(i))
+        if not len(later):
+            continue
         later = later[np.argsort(motions.head_s[later], kind="stable")]
         dt_s = motions.head_s[later] - motions.tail_s[i]
         if moved is None:
@@ -144,33 +149,75 @@ def _pairs(
         else:
             state, cov = moved(int(i), dt_s)
         earlier = np.full(len(later), i)
-        parts.append((earlier, later, motions.head[later] - state, motions.head_cov[later] + cov))
+        apart = motions.head[later] - state
+        parts.append(_compared(earlier, later, apart, motions.head_cov[later] + cov))
     for j in np.flatnonzero(moves):  # backward, to earlier objects of unknown velocity
-        earlier = np.flatnonzero(kept[:, j] & ~moving)
+        earlier = may_be.earlier(int(j))
+        earlier = earlier[~moving[earlier]]
+        if not len(earlier):
+            continue
         earlier = earlier[np.argsort(-motions.tail_s[earlier], kind="stable")]
         state, cov = _propagated(
             motions.head[j], motions.head_cov[j], motions.tail_s[earlier] - motions.head_s[j]
         )
         later = np.full(len(earlier), j)
-        parts.append(
-            (earlier, later, state - motions.tail[earlier], motions.tail_cov[earlier] + cov)
-        )
+        apart = state - motions.tail[earlier]
+        parts.append(_compared(earlier, later, apart, motions.tail_cov[earlier] + cov))
     none = np.zeros(0, np.int64)
-    parts.append((none, none, np.zeros((0, 6)), np.zeros((0, 6, 6))))
+    parts.append(_compared(none, none, np.zeros((0, 6)), np.zeros((0, 6, 6))))
+    before = np.cumsum([0, *(len(part.later) for part in parts)])
+    parts = [part._replace(near=part.near + at) for part, at in zip(parts, before, strict=False)]
     return _CandidatePairs(*(np.concatenate(column) for column in zip(*parts, strict=True)))
 
 
-def _energies_agree(motions: ObservedMotions) -> Flags:
-    """Return which (earlier, later) pairs agree in energy; true where either is unknown.
+def _compared(earlier: Indices, later: Indices, apart: Array, cov: Array) -> _CandidatePairs:
+    """Return pairs with their distances, by the differences (p, 6) and covariances (p, 6, 6)."""
+    d2, fits = np.full(len(later), np.inf), np.zeros(len(later), bool)
+    is_moving = np.isfinite(apart).all(axis=1)
+    for rows, size in ((np.flatnonzero(is_moving), 6), (np.flatnonzero(~is_moving), 3)):
+        d, S = apart[rows, :size], cov[rows, :size, :size]
+        d2[rows] = np.sum(d * np.linalg.solve(S, d[:, :, None])[:, :, 0], axis=1)
+        fits[rows] = d2[rows] < 2 * gammaincinv(size / 2, GATE_SHARE)  # chi-square
+    near = np.flatnonzero(fits)
+    return _CandidatePairs(earlier, later, apart, d2, near, cov[near])
 
-    A fast, wide gate: two-body motion keeps the energy, and J2 changes it by a thousandth.
+
+class _PossiblePairs:
+    """Which objects agree in time and energy, object by object: all pairs would fill the memory.
+
+    The energy is a fast, wide gate: two-body motion keeps it, and J2 changes it by a thousandth.
+    Objects of unknown energy pass.
     """
-    tail, tail_variance = _energy(motions.tail, motions.tail_cov)
-    head, head_variance = _energy(motions.head, motions.head_cov)
-    gate = MAX_ENERGY_SIGMA * np.sqrt(
-        tail_variance[:, None] + head_variance
-    ) + OBLATENESS_SHARE * np.abs(head)
-    return ~(np.abs(tail[:, None] - head) > gate)
+
+    def __init__(self, motions: ObservedMotions, gap_s: float, allowed: Flags | None) -> None:
+        self._motions, self._gap_s, self._allowed = motions, gap_s, allowed
+        self._by_first = np.argsort(motions.first_s, kind="stable")
+        self._by_last = np.argsort(motions.last_s, kind="stable")
+        self._first, self._last = motions.first_s[self._by_first], motions.last_s[self._by_last]
+        self._tail = _energy(motions.tail, motions.tail_cov)
+        self._head = _energy(motions.head, motions.head_cov)
+
+    def later(self, i: int) -> Indices:
+        """Return the objects that object i may continue as."""
+        last = self._motions.last_s[i]
+        at = np.searchsorted(self._first, [last, last + self._gap_s + MARGIN_S])
+        later = np.sort(self._by_first[at[0] : at[1]])
+        return np.asarray(later[self._agree(np.full(len(later), i), later)])
+
+    def earlier(self, j: int) -> Indices:
+        """Return the objects that may continue as object j."""
+        first = self._motions.first_s[j]
+        at = np.searchsorted(self._last, [first - self._gap_s - MARGIN_S, first])
+        earlier = np.sort(self._by_last[at[0] : at[1]])
+        return np.asarray(earlier[self._agree(earlier, np.full(len(earlier), j))])
+
+    def _agree(self, earlier: Indices, later: Indices) -> Flags:
+        gap = self._motions.first_s[later] - self._motions.last_s[earlier]
+        tail, head = self._tail[0][earlier], self._head[0][later]
+        sigma = np.sqrt(self._tail[1][earlier] + self._head[1][later])
+        gate = MAX_ENERGY_SIGMA * sigma + OBLATENESS_SHARE * np.abs(head)
+        agree = (gap > 0.0) & (gap <= self._gap_s) & ~(np.abs(tail - head) > gate)
+        return agree if self._allowed is None else agree & self._allowed[earlier, later]
 
 
 def _energy(state: Array, cov: Array) -> tuple[Array, Array]:
@@ -186,23 +233,22 @@ def _log_odds_of_pairs(motions: ObservedMotions, pairs: _CandidatePairs) -> Arra
     """Return the log odds of each pair; -inf where the difference is too large."""
     gain = np.full(len(pairs.later), -np.inf)
     order = np.argsort(pairs.later, kind="stable")
-    cuts = np.flatnonzero(np.diff(pairs.later[order])) + 1
-    for same_later in np.split(order, cuts) if len(order) else []:
-        present = _differences_to_present(motions, int(pairs.later[same_later[0]]))
-        past = pairs.earlier[same_later]
-        for k in same_later:
+    bounds = np.searchsorted(pairs.later[order], np.arange(len(motions.first_s) + 1))
+    of_near = pairs.later[pairs.near]
+    for j in np.unique(of_near).tolist():
+        same_later = order[bounds[j] : bounds[j + 1]]
+        present, past = _differences_to_present(motions, j), pairs.earlier[same_later]
+        for n in np.flatnonzero(of_near == j):
+            k = pairs.near[n]
             i, size = pairs.earlier[k], 6 if np.isfinite(pairs.apart[k]).all() else 3
-            S, d = pairs.cov[k, :size, :size], pairs.apart[k, :size]
-            d2 = float(d @ np.linalg.solve(S, d))
-            if not d2 < 2 * gammaincinv(size / 2, GATE_SHARE):  # chi-square
-                continue
+            S = pairs.cov[n, :size, :size]
             # Objects that were observed at the same time are different objects.
             distinct = (motions.first_s[past] <= motions.last_s[i]) & (
                 motions.last_s[past] >= motions.first_s[i]
             )
             others = np.concatenate([pairs.apart[same_later[distinct & (past != i)]], present])
             density = _log_density(others[:, :size], S)
-            gain[k] = -d2 / 2 - np.linalg.slogdet(2 * np.pi * S)[1] / 2 - density
+            gain[k] = -pairs.d2[k] / 2 - np.linalg.slogdet(2 * np.pi * S)[1] / 2 - density
     return gain
 
 
@@ -236,18 +282,15 @@ def _differences_to_present(motions: ObservedMotions, later: int) -> Array:
         motions.last_s >= motions.first_s[later]
     )
     present[later] = False
-    out = np.empty((int(present.sum()), 6))
-    for row, k in enumerate(np.flatnonzero(present)):
-        near_head = abs(motions.head_s[k] - at) < abs(motions.tail_s[k] - at)
-        state, when = (
-            (motions.head[k], motions.head_s[k])
-            if near_head
-            else (motions.tail[k], motions.tail_s[k])
-        )
-        if np.isfinite(state[3]):
-            state = trajectory(state, np.array([at - when]))[0][0]
-        out[row] = motions.head[later] - state
-    return out
+    rows = np.flatnonzero(present)
+    near_head = np.abs(motions.head_s[rows] - at) < np.abs(motions.tail_s[rows] - at)
+    state = np.where(near_head[:, None], motions.head[rows], motions.tail[rows])
+    dt_s = at - np.where(near_head, motions.head_s[rows], motions.tail_s[rows])
+    is_moving = np.flatnonzero(np.isfinite(state[:, 3]))
+    steps = int(np.ceil(np.abs(dt_s).max(initial=1.0) / STEP_S))
+    r_km, v_km_s = np.split(state[is_moving], 2, axis=1)
+    state[is_moving] = np.hstack(propagate_states(r_km, v_km_s, dt_s[is_moving], steps))
+    return np.asarray(motions.head[later] - state)
 
 
 def _log_density(apart: Array, S: Array) -> float:

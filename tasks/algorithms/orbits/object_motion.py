@@ -178,9 +178,11 @@ class ObjectRegistry:
                     votes_of[self._object_of[t]] += 1.0 if self._weight is None else self._weight[t]
             votes += [(-weight, number, g) for number, weight in votes_of.items()]
         named: dict[int, int] = {}
+        given: set[int] = set()
         for _, number, g in sorted(votes):
-            if g not in named and number not in named.values():
+            if g not in named and number not in given:
                 named[g] = number
+                given.add(number)
         for g, members in enumerate(groups):
             if g not in named:
                 named[g] = self._count

@@ -1,5 +1,7 @@
 """Object linking: recognised by motion, never mistaken, and not linked where two are possible."""
 
+import tracemalloc
+
 import numpy as np
 import pytest
 
@@ -215,3 +217,16 @@ def test_two_objects_seen_at_one_time_are_not_both_an_earlier_one():
     seen = motions([(LOW, 0, 60), (LOW, 120, 180), (LOW, 150, 200)], rng)
     before, _ = link_by_motion(seen, **RULE)
     assert before.tolist() == [NONE, NONE, NONE]
+
+
+def test_objects_that_are_hours_apart_take_no_memory_by_pairs():
+    n = 2000
+    times = 10_000.0 * np.arange(n)
+    states, covs = np.tile(GEO, (n, 1)), np.tile(np.diag(SIGMA**2), (n, 1, 1))
+    seen = ObservedMotions(times, times + ARC_S, times, times + ARC_S, states, states, covs, covs)
+    tracemalloc.start()
+    before, _ = link_by_motion(seen, **RULE)
+    _, most = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert (before == NONE).all()
+    assert most < 16 * n**2 / 2  # half of two matrices of all pairs
