@@ -329,7 +329,8 @@ class Reason(StrEnum):
     STATE_MISFIT = (
         "state_misfit",
         Stage.SOLVE,
-        "The chi-square of an object's state does not fit its degrees of freedom.",
+        "The chi-square of an object's state does not fit its degrees of freedom, or its fit does "
+        "not converge.",
     )
     MANOEUVRE = (
         "manoeuvre",

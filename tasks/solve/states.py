@@ -34,7 +34,7 @@ SLOPE_S = 60.0  # positions within this time of an arc's middle give the initial
 
 
 def fit_states(groups: ViewGroups, settings: StateSettings) -> pa.Table:
-    """Return STATES: one for each object and arc, at the arc's middle epoch.
+    """Return STATES: one for each object and arc, at the arc's middle epoch; NaN if a fit fails.
 
     Only the views used for `independent` positions are fitted: no two of these share a detection.
     Each sensor's common error is estimated together with the state.
@@ -153,7 +153,7 @@ def refuse_misfits(states: pa.Table) -> FittingStates:
     """Return the states whose chi-square fits their degrees of freedom.
 
     Other states mix two objects, or the errors of their views are larger than stated. Their
-    covariances are not valid.
+    covariances are not valid. Failed fits are among them: their chi-square is NaN.
     """
     fits = chdtrc(array(states, "dof"), array(states, "chi2")) > MIN_PROBABILITY
     misfits = states.filter(pa.array(~fits)).sort_by("epoch")
@@ -193,11 +193,10 @@ def _starts(groups: ViewGroups, named: _NamedArcs) -> Array:
 def _state_table(
     named: _NamedArcs, orbits: FittedOrbits, counts: Mapping[str, Indices]
 ) -> pa.Table:
-    """Return STATES of the arcs whose fit converged, in order of time."""
+    """Return STATES of the arcs, in order of time."""
     object_id, epoch_ns = named.object_id, named.middle_ns
     state, cov, chi2 = orbits.state, orbits.cov, orbits.chi2
-    fitted = np.flatnonzero(np.isfinite(chi2))
-    fitted = fitted[np.lexsort((object_id[fitted].astype(str), epoch_ns[fitted]))]
+    order = np.lexsort((object_id.astype(str), epoch_ns))
     columns = {
         "epoch": epoch_ns,
         "object_id": object_id,
@@ -208,4 +207,4 @@ def _state_table(
         "dof": (2 * counts["n_views"] - 6).astype(np.int32),
         "chi2": chi2,
     }
-    return table(STATES, {name: values[fitted] for name, values in columns.items()})
+    return table(STATES, {name: values[order] for name, values in columns.items()})

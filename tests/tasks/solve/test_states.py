@@ -110,6 +110,14 @@ def test_groups_without_a_position_give_no_state():
     assert fit_states(groups._replace(chi2=np.full(3, np.nan)), SETTINGS).num_rows == 0
 
 
+def test_a_state_whose_fit_fails_has_a_reject():
+    groups = night(1, np.arange(-60.0, 61, 20), n_sensors=2)
+    inward = groups.views._replace(u=-groups.views.u)
+    kept, rejects = refuse_misfits(fit_states(groups._replace(views=inward), SETTINGS))
+    assert kept.num_rows == 0
+    assert rejects["reason"].to_pylist() == ["state_misfit"]
+
+
 def test_a_state_that_does_not_fit_is_refused_and_has_a_reject():
     groups = night(1, np.arange(-60.0, 61, 20))
     states = fit_states(groups, SETTINGS)
