@@ -18,6 +18,7 @@ from itertools import chain
 from typing import NamedTuple
 
 import numpy as np
+from scipy.sparse import coo_array, csr_array
 
 from epipole.schemas.arrays import Array, Flags, Indices
 from epipole.tasks.algorithms.association.hypothesis_queue import Hypothesis
@@ -367,19 +368,44 @@ def sets_of_sensors(views: Views, groups: Sequence[Hypothesis]) -> SensorSets:
     looks = looks_of(views, groups)
     seen = np.zeros((len(groups), len(views.half_field)), np.bool_)
     seen[looks.row, looks.sensor] = True
-    rows, of, count = np.unique(seen, axis=0, return_inverse=True, return_counts=True)
+    # Packed, they are sorted in the same order and eight times as fast.
+    packed, of, count = np.unique(
+        np.packbits(seen, axis=1), axis=0, return_inverse=True, return_counts=True
+    )
+    rows = np.unpackbits(packed, axis=1, count=seen.shape[1]).astype(np.bool_)
+    kept, same_as = _distinct_sets(rows, np.argsort(-count, kind="stable"))
+    common = coo_array(csr_array(rows[kept].astype(np.int32)) @ csr_array(seen.T.astype(np.int32)))
+    several = common.data > 1
+    row, group = (np.asarray(of_axis[several], np.int64) for of_axis in common.coords)
+    order = np.lexsort((group, row))
+    sets = [np.flatnonzero(r) for r in rows[kept]]
+    return SensorSets(sets, same_as[of.ravel()], row[order], group[order])
+
+
+def _distinct_sets(rows: Flags, order: Indices) -> tuple[list[int], Indices]:
+    """Return which sets of sensors, (r, s) bool, are kept, and for each set the kept one that it is
+    merged into.
+
+    Sets are compared with those that share a sensor with them: thousands of sensors, few of which
+    look at one place, have nearly as many sets as groups.
+    """
+    size, size_of_kept = rows.sum(axis=1), np.zeros(len(rows), np.int64)
     kept: list[int] = []
+    kept_of_sensor: list[list[int]] = [[] for _ in range(rows.shape[1])]
     same_as = np.empty(len(rows), np.int64)
-    for k in np.argsort(-count, kind="stable").tolist():
-        shared = (rows[kept] & rows[k]).sum(axis=1) / (rows[kept] | rows[k]).sum(axis=1)
-        if len(kept) and shared.max() >= SAME_SENSORS:
-            same_as[k] = np.argmax(shared)
-        else:
-            same_as[k] = len(kept)
-            kept.append(k)
-    common = rows[kept].astype(np.float32) @ seen.T.astype(np.float32)
-    row, group = np.nonzero(common > 1.5)  # these are whole numbers
-    return SensorSets([np.flatnonzero(r) for r in rows[kept]], same_as[of.ravel()], row, group)
+    for k in order.tolist():
+        sensors = np.flatnonzero(rows[k]).tolist()
+        near = np.array(list(chain.from_iterable(kept_of_sensor[s] for s in sensors)), np.int64)
+        near, shared = np.unique(near, return_counts=True)
+        likeness = shared / (size[k] + size_of_kept[near] - shared)
+        if likeness.max(initial=0.0) >= SAME_SENSORS:
+            same_as[k] = near[np.argmax(likeness)]
+            continue
+        same_as[k], size_of_kept[len(kept)] = len(kept), size[k]
+        for s in sensors:
+            kept_of_sensor[s].append(len(kept))
+        kept.append(k)
+    return kept, same_as
 
 
 def revised_odds(

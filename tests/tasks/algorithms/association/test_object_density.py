@@ -118,6 +118,30 @@ def test_a_set_counts_the_groups_that_two_of_its_sensors_have_in_their_fields():
     assert counted == {(0, 1, 2): [0, 2], (2, 3, 4): [1, 3], (0, 1): [0, 2], (3, 4): [1, 3]}
 
 
+@pytest.mark.parametrize(("n_sensors", "largest"), [(5, 5), (40, 4), (12, 12)])
+def test_sets_are_those_of_a_comparison_of_all_with_all(n_sensors, largest):
+    rng = np.random.default_rng(n_sensors)
+    views = ten_tracklets(1, n_sensors=2, n_objects=1, n_strays=0, seen=1.0).space.views
+    views = views._replace(
+        sensor=np.arange(n_sensors), camera=np.zeros((n_sensors, 1, views.camera.shape[2]))
+    )
+    groups, x = [], np.zeros(3)
+    for _ in range(80):
+        seeing = np.sort(rng.choice(n_sensors, rng.integers(2, largest + 1), replace=False))
+        members, missed = tuple(seeing[:2].tolist()), seeing[2:]
+        groups.append(Hypothesis(9.0, members, members, x, missed))
+    inside = [{*g.members, *g.missed.tolist()} for g in groups]
+    sets = sets_of_sensors(views, groups)
+    kept = [set(s.tolist()) for s in sets.sensors]
+    for g, sensors in enumerate(inside):
+        like = [len(sensors & of) / len(sensors | of) for of in kept]
+        assert like[sets.set_of[g]] >= 0.8
+    pairs = [(k, g) for k, of in enumerate(kept) for g, s in enumerate(inside) if len(of & s) > 1]
+    assert list(zip(sets.row.tolist(), sets.group.tolist(), strict=True)) == pairs
+    alike = [len(a & b) / len(a | b) for k, a in enumerate(kept) for b in kept[:k]]
+    assert max(alike, default=0.0) < 0.8
+
+
 @pytest.mark.parametrize(
     ("own", "rate"), [(0.0, 21 / 1001), (50.0, 21 / 1001 / (50 * 21 / 1001 + 1))]
 )
