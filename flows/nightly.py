@@ -12,7 +12,12 @@ from prefect import flow
 
 from epipole.flows.night.calibrating import calibrate, find_cameras
 from epipole.flows.night.doubt import settle
-from epipole.flows.night.log_checks import check_logs, check_readings, wrong_velocities
+from epipole.flows.night.log_checks import (
+    check_logs,
+    check_readings,
+    check_star_scatter,
+    wrong_velocities,
+)
 from epipole.flows.night.log_choice import (
     LastNights,
     Night,
@@ -284,6 +289,7 @@ def make_night(
     work = identify(frames, spans, folder, settings)
     work, stated = find_cameras(work, settings)
     work, calibrations = calibrate(work, stated, settings)
+    checks = check_star_scatter(work, checks)
     while True:
         work = track(work, night, settings)
         solved = solve(work, settings)

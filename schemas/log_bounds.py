@@ -69,8 +69,10 @@ FLUX = Bound(
     "Beyond the bounds it is unknown, as where it is zero or negative.",
 )
 CENTROID_SIGMA = Bound(
-    "sigma_px", 1e-6, 1e4, "px", Reason.BAD_SIGMA, "A millionth of a pixel to a tenth of an image."
-)
+    "sigma_px", 1e-6, 1e4, "px", Reason.BAD_SIGMA,
+    "A millionth of a pixel to a tenth of an image. Below a thousandth it is unknown: no camera "
+    "reaches that.",
+)  # fmt: skip
 
 # Of a state.
 POSITION = Bound(

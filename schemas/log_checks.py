@@ -101,6 +101,22 @@ class LogCheck(StrEnum):
         "Where the median flux lies between the smallest and the largest, 0 to 1.",
         "fluxes are linear",
     )
+    EXPOSURE_TIME = (
+        "exposure_time",
+        "Median exposure time over the median time from frame to frame.",
+        "exposures end before the next frame",
+    )
+    CALIBRATION = (
+        "calibration",
+        "Calibrations of the sensor.",
+        "there is a calibration",
+    )
+    CENTROID_SIGMA = (
+        "centroid_sigma",
+        "Scatter of the stars about their catalogue positions, per axis; expected: their stated "
+        "sigma. Before a run: the median stated sigma.",
+        "stars scatter by {value:.2g} px, stated are {expected:.2g} px",
+    )
     LINES_OF_SIGHT = (
         "lines_of_sight",
         "Share of the views that meet a view of another sensor at the same time, as the states are "
@@ -423,6 +439,50 @@ class LogCause(StrEnum):
         CheckVerdict.WRONG,
         "fluxes look like magnitudes: {low:.1f} to {high:.1f}, most of them near the largest",
         "write flux linear, 10**(-0.4 magnitude), or leave it empty",
+    )
+
+    EXPOSURE_TOO_LONG = (
+        "exposure_too_long",
+        CheckVerdict.WRONG,
+        "exposures last {exposure_s:.3g} s, and a frame follows another after {interval_s:.3g} s",
+        "write exposure_s in seconds, 0 where it is unknown",
+    )
+    NO_CALIBRATION = (
+        "no_calibration",
+        CheckVerdict.WRONG,
+        "{frames:,.0f} frames and no valid calibration: the sensor takes no part",
+        "add the log that has it, or write the calibration that `epipole calibrate` finds",
+    )
+    IMPOSSIBLE_CENTROID_SIGMA = (
+        "impossible_centroid_sigma",
+        CheckVerdict.WRONG,
+        "stated errors of centroids are {value:.2g} px, and no camera measures stars so well",
+        "write the 1-sigma error per axis in pixels, or leave sigma_px empty",
+    )
+    CENTROID_SIGMA_TOO_SMALL = (
+        "centroid_sigma_too_small",
+        CheckVerdict.WRONG,
+        "stars scatter by {value:.2g} px, stated are {expected:.2g} px",
+        "write the 1-sigma error per axis in pixels, or leave sigma_px empty",
+    )
+    CENTROID_SIGMA_TOO_LARGE = (
+        "centroid_sigma_too_large",
+        CheckVerdict.WRONG,
+        "stars scatter by only {value:.2g} px, stated are {expected:.2g} px",
+        "write the 1-sigma error per axis in pixels, or leave sigma_px empty",
+    )
+    NO_CENTROID_SIGMA = (
+        "no_centroid_sigma",
+        CheckVerdict.UNKNOWN,
+        "no errors of centroids are stated: a run learns them from stars",
+        "",
+    )
+    CENTROID_SIGMA_UNCOMPARED = (
+        "centroid_sigma_uncompared",
+        CheckVerdict.UNKNOWN,
+        "stated errors of centroids are {value:.2g} px; only a run with identified stars "
+        "compares them",
+        "",
     )
 
     # Of lines of sight: with another reading they meet.

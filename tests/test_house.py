@@ -17,7 +17,6 @@ SMALL = {
     "tasks": "the stages are sub-packages",
     "tasks/algorithms/sensor_faults": "above all other mathematics",
     "tasks/algorithms/tracking/linking": "a published method beside the default",
-    "tasks/calibrate": "a stage",
     "tasks/track": "a stage",
     "tasks/simulate": "a flow's tasks: the pipeline may not read it",
 }

@@ -48,7 +48,7 @@ def find_cameras(work: Work, settings: Settings) -> tuple[Work, pa.Table]:
         find_sensor_cameras.submit(
             work.frames, batch, work.cameras, settings.sensors, settings.identification
         )
-        for batch in work.sensor_batches(_stars_of(work, work.spans))
+        for batch in work.sensor_batches(stars_of(work, work.spans))
     ]
     findings: list[CameraFinding] = flat(results(Stage.CALIBRATE, futures))
     for finding in findings:
@@ -98,13 +98,13 @@ def _fit_sensors(
         calibrate_each.submit(
             batch, work.cameras, stated, settings.sensors.principal_point_sigma_px
         )
-        for batch in work.sensor_batches(_stars_of(work, sensors))
+        for batch in work.sensor_batches(stars_of(work, sensors))
     ]
     fits: list[Calibrated] = flat(results(Stage.CALIBRATE, futures))
     return fits
 
 
-def _stars_of(work: Work, sensors: Iterable[Sensor]) -> list[SensorStars]:
+def stars_of(work: Work, sensors: Iterable[Sensor]) -> list[SensorStars]:
     """Return where the identified stars of these sensors are."""
     return [SensorStars(sensor, work.spans[sensor], work.identified[sensor]) for sensor in sensors]
 

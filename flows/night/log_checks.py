@@ -5,9 +5,12 @@ from collections.abc import Sequence
 
 import numpy as np
 import pyarrow as pa
+import pyarrow.compute as pc
 
+from epipole.flows.night.calibrating import stars_of
 from epipole.flows.night.doubt import Settled
 from epipole.flows.night.progress import results
+from epipole.flows.night.work import Work
 from epipole.io.datasets.rows_by_night import rows_of_night
 from epipole.io.work.parts import read_part
 from epipole.schemas.bridge import array, concat
@@ -16,6 +19,7 @@ from epipole.schemas.settings import Settings
 from epipole.schemas.spans import DAY_NS, SPAN_NS, day_of
 from epipole.schemas.stages import Stage
 from epipole.schemas.tables import CHECKS
+from epipole.tasks.calibrate.judge_star_scatter import judge_star_scatter
 from epipole.tasks.check.judge_doubt import doubt_table, name_cut_times
 from epipole.tasks.check.judge_readings import judge_readings
 from epipole.tasks.common.batches import in_batches
@@ -73,6 +77,22 @@ def wrong_velocities(checks: pa.Table) -> set[str]:
         for row in checks.select(["sensor_id", "check", "verdict"]).to_pylist()
         if row["check"] == LogCheck.VELOCITY and row["verdict"] == CheckVerdict.WRONG
     }
+
+
+def check_star_scatter(work: Work, checks: pa.Table) -> pa.Table:
+    """Return CHECKS with what the stars of a night say of the stated errors of centroids."""
+    futures = [
+        judge_star_scatter.submit(work.frames, batch)
+        for batch in work.sensor_batches(stars_of(work, work.spans))
+    ]
+    found = concat(CHECKS, results(Stage.CALIBRATE, futures))
+    is_sigma = pc.equal(checks["check"], LogCheck.CENTROID_SIGMA.value)
+    judged = pc.and_(is_sigma, pc.is_in(checks["sensor_id"], found["sensor_id"].combine_chunks()))
+    # Of a sensor whose errors are impossible, the warning was given.
+    wrong = pc.and_(is_sigma, pc.equal(checks["verdict"], CheckVerdict.WRONG.value))
+    warned = checks.filter(wrong)["sensor_id"].combine_chunks()
+    _with_warnings(found.filter(pc.invert(pc.is_in(found["sensor_id"], warned))))
+    return concat(CHECKS, [checks.filter(pc.invert(judged)), found])
 
 
 def check_readings(settled: Settled, frames: OrderedFrames, checks: pa.Table) -> pa.Table:

@@ -23,6 +23,7 @@ from epipole.tasks.algorithms.geometry.camera import (
     row_offset_s,
     unproject,
 )
+from epipole.tasks.algorithms.log_checks.frames import LEAST_SIGMA_PX
 from epipole.tasks.algorithms.orbits.state_interpolation import (
     InterpolatedStates,
     SensorStates,
@@ -45,7 +46,7 @@ class FlatCentroids(NamedTuple):
     x_px: Array
     y_px: Array
     flux: Array
-    sigma_px: Array  # NaN where the sensor states none; a missing one is the median of the others
+    sigma_px: Array  # NaN where none is possible as stated; a missing one is the others' median
     u: Array  # sensor axes at the frame's time
     pixel_rad: Array
     in_image: Flags  # of the frame's camera; false without one
@@ -63,6 +64,7 @@ def flatten_centroids(
     y_px, _ = flatten(exposures, "y_px")
     frame = np.repeat(np.arange(exposures.num_rows), np.diff(first))
     sigma_px = _optional(exposures, "sigma_px", len(x_px))
+    sigma_px[sigma_px < LEAST_SIGMA_PX] = np.nan
     if settings.centroid_sigma_px is not None:
         sigma_px = np.where(np.isnan(sigma_px), settings.centroid_sigma_px, sigma_px)
     sigma_px = filled_sigmas(sigma_px)

@@ -1,6 +1,7 @@
 """Judge the logs of a night: what is written as it says, of each sensor."""
 
 from collections.abc import Iterable
+from functools import lru_cache
 from pathlib import Path
 from typing import NamedTuple
 
@@ -16,8 +17,16 @@ from epipole.tasks.algorithms.log_checks.findings import FRAMES_ALL_NIGHT, WRONG
 from epipole.tasks.algorithms.log_checks.frames import check_night
 from epipole.tasks.common.batches import Batch
 from epipole.tasks.common.stage_tasks import stage_task
-from epipole.tasks.read.judge_sensor import LEFT_OUT, checks_table, judge_sensor, sensor_log
+from epipole.tasks.read.judge_sensor import (
+    LEFT_OUT,
+    checks_table,
+    judge_sensor,
+    rows_by_sensor,
+    sensor_log,
+)
 from epipole.tasks.read.order_frames import OrderedFrames
+
+OPEN_PIECES = 64  # tables of pieces of logs whose rows are sorted by sensor once for many sensors
 
 
 class NightFrames(NamedTuple):
@@ -69,11 +78,22 @@ def judge_logs(
         Largest time from a frame to the nearest state [s].
     """
     found = {}
+
+    @lru_cache(maxsize=OPEN_PIECES)
+    def rows_of(piece: Path, name: str) -> tuple[pa.Table, dict[str, Integers]]:
+        rows = read_part(piece, name)
+        return rows, rows_by_sensor(rows, between_ns)
+
     for sensor, pieces in sensors:
         exposures, states = (
-            [read_part(piece, name) for piece in pieces] for name in ("exposures", "states")
+            [
+                (rows, of_sensors[sensor])
+                for rows, of_sensors in (rows_of(piece, name) for piece in pieces)
+                if sensor in of_sensors
+            ]
+            for name in ("exposures", "states")
         )
-        log = sensor_log(sensor, exposures, states, cameras, rejects, between_ns)
+        log = sensor_log(sensor, exposures, states, cameras, rejects)
         found[sensor] = judge_sensor(log, state_gap_s)
         if night is not None and (of_night := _of_night(log.time_ns, night)) is not None:
             found[sensor].append(of_night)

@@ -8,7 +8,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 
-from epipole.schemas.arrays import Integers
+from epipole.schemas.arrays import Array, Integers
 from epipole.schemas.bridge import array, concat, flatten, nullable, rows_with, stack, table
 from epipole.schemas.log_checks import LogCause, LogCheck
 from epipole.schemas.rejects import Reason, by_reason
@@ -49,6 +49,9 @@ _SCALES = {
 }
 
 
+RowsOf = tuple[pa.Table, Integers]  # a table, and the rows of it that are meant
+
+
 class SensorLog(NamedTuple):
     """What the logs have of one sensor, in any order.
 
@@ -66,30 +69,30 @@ class SensorLog(NamedTuple):
 
 def sensor_log(
     sensor: str,
-    exposures: Sequence[pa.Table],
-    states: Sequence[pa.Table],
+    exposures: Sequence[RowsOf],
+    states: Sequence[RowsOf],
     cameras: pa.Table,
     rejects: pa.Table,
-    between_ns: tuple[int, int] = ALL_TIME,
 ) -> SensorLog:
-    """Return what EXPOSURES, LOG_STATES, CAMERAS and REJECTS have of one sensor."""
-    rows = [_rows_of(of, sensor, between_ns) for of in exposures]
-    of_rows = list(zip(exposures, rows, strict=True))
+    """Return what EXPOSURES, LOG_STATES, CAMERAS and REJECTS have of one sensor.
+
+    `exposures` and `states` are rows of this sensor, see `rows_by_sensor`.
+    """
     time_ns, number = (
-        np.concatenate([np.zeros(0, np.int64), *(array(of, name)[k] for of, k in of_rows)])
+        np.concatenate([np.zeros(0, np.int64), *(array(of, name)[k] for of, k in exposures)])
         for name in ("time", "frame_number")
     )
     chosen = _sample(time_ns, number)
-    bounds = np.cumsum([0, *map(len, rows)])
+    bounds = np.cumsum([0, *(len(k) for _, k in exposures)])
     sampled = [
         of.take(k[chosen[(first <= chosen) & (chosen < end)] - first])
-        for (of, k), (first, end) in zip(of_rows, pairwise(bounds), strict=True)
+        for (of, k), (first, end) in zip(exposures, pairwise(bounds), strict=True)
     ]
     return SensorLog(
         time_ns,
         number,
         concat(EXPOSURES, sampled),
-        concat(LOG_STATES, [of.take(_rows_of(of, sensor, between_ns)) for of in states]),
+        concat(LOG_STATES, [of.take(k) for of, k in states]),
         rows_with(cameras, "sensor_id", sensor),
         by_reason(rows_with(rejects, "sensor_id", sensor)),
     )
@@ -103,10 +106,18 @@ def _sample(time_ns: Integers, number: Integers) -> Integers:
     return np.sort(first[:: max(len(first) // MAX_SAMPLED, 1)])
 
 
-def _rows_of(rows: pa.Table, sensor: str, between_ns: tuple[int, int]) -> Integers:
-    of_sensor = np.asarray(pc.equal(rows["sensor_id"], sensor).to_numpy(), bool)
+def rows_by_sensor(rows: pa.Table, between_ns: tuple[int, int] = ALL_TIME) -> dict[str, Integers]:
+    """Return the rows of each sensor between two times, in the order of the table: one pass."""
     time_ns = array(rows, "time")
-    return np.flatnonzero(of_sensor & (time_ns >= between_ns[0]) & (time_ns < between_ns[1]))
+    inside = np.flatnonzero((time_ns >= between_ns[0]) & (time_ns < between_ns[1]))
+    ids = rows["sensor_id"].combine_chunks().dictionary_encode()
+    code = np.asarray(ids.indices.to_numpy())[inside]
+    order = np.argsort(code, kind="stable")
+    bounds = np.searchsorted(code[order], np.arange(len(ids.dictionary) + 1))
+    return {
+        name: inside[order[first:end]]
+        for name, (first, end) in zip(ids.dictionary.to_pylist(), pairwise(bounds), strict=True)
+    }
 
 
 def judge_sensor(log: SensorLog, state_gap_s: float) -> list[Finding]:
@@ -126,17 +137,21 @@ def judge_sensor(log: SensorLog, state_gap_s: float) -> list[Finding]:
 
 def judge_log(log: LogContents, state_gap_s: float) -> pa.Table:
     """Return CHECKS of all sensors of one log, those too of which nothing could be read."""
-    named = (log.exposures, log.states, log.rejects)
-    names = {name for rows in named for name in rows["sensor_id"].unique().to_pylist() if name}
+    exposures, states = rows_by_sensor(log.exposures), rows_by_sensor(log.states)
+    names = {*exposures, *states, *log.rejects["sensor_id"].drop_null().to_pylist()} - {""}
+    nothing = np.zeros(0, np.int64)
     return checks_table(
         {
             name: judge_sensor(
-                sensor_log(name, [log.exposures], [log.states], log.cameras, log.rejects),
+                sensor_log(
+                    name, [(log.exposures, exposures.get(name, nothing))],
+                    [(log.states, states.get(name, nothing))], log.cameras, log.rejects,
+                ),
                 state_gap_s,
             )
             for name in names
         }
-    )
+    )  # fmt: skip
 
 
 def _log_states(states: pa.Table) -> LogStates:
@@ -158,15 +173,22 @@ def _log_frames(log: SensorLog) -> LogFrames:
     """Return the frames in order of time, each once."""
     keys = np.unique(np.stack([log.time_ns, log.number], axis=1), axis=0)
     once = np.diff(keys[:, 0], prepend=-1) > 0
-    with_flux = log.sampled.filter(pc.is_valid(log.sampled["flux"]))
     return LogFrames(
         keys[once, 0],
         keys[once, 1],
         keys[:, 1],
         flatten(log.sampled, "x_px")[0],
         flatten(log.sampled, "y_px")[0],
-        flatten(with_flux, "flux")[0],
+        _known(log.sampled, "flux"),
+        _known(log.sampled, "sigma_px"),
+        array(log.sampled, "exposure_s"),
     )
+
+
+def _known(exposures: pa.Table, name: str) -> Array:
+    """Return the values of a list column that are known."""
+    values = flatten(exposures.filter(pc.is_valid(exposures[name])), name)[0]
+    return values[values > 0] if name == "sigma_px" else values
 
 
 def _camera(cameras: pa.Table) -> LogCamera | None:

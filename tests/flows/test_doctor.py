@@ -2,8 +2,9 @@
 
 import json
 
+import polars as pl
 import pytest
-from scenes.log_mistakes import MISTAKES, rewritten, starts_of_exposures
+from scenes.log_mistakes import MISTAKES, centroid_sigma, rewritten, starts_of_exposures
 
 from epipole.flows import api
 from epipole.flows.command_line.main import app
@@ -50,13 +51,13 @@ def test_a_mistake_ends_with_1_and_has_its_cure(wrong_log):
 
 def test_what_a_run_would_leave_out_ends_with_1(night_log, tmp_path):
     log, copy = api.read_log(night_log), tmp_path / "a.mcap"
-    with pytest.warns(LogWarning, match="bad_camera_matrix"):
-        api.write_log(copy, log.frames, log.states, log.cameras.with_columns(fx_px=0.0))
+    with pytest.warns(LogWarning, match="bad_exposure"):
+        api.write_log(copy, log.frames.with_columns(exposure_s=-1.0), log.states, log.cameras)
     result = run("doctor", copy, "--json")
     found = json.loads(result.output)
     assert (result.exit_code, found["sound"], found["mistakes"]) == (1, False, [])
     (left_out,) = found["left_out"]
-    assert left_out.startswith(f"{log.cameras.height} bad_camera_matrix: ")
+    assert left_out.startswith(f"{log.frames.height} bad_exposure: ")
     assert f"  {left_out}" in lines(doctor([str(copy)]))
 
 
@@ -69,11 +70,13 @@ def test_a_file_that_is_no_log_is_refused(tmp_path):
 def test_a_run_writes_the_same_checks_and_shows_mistakes(prefect, wrong_log, tmp_path, caplog):
     summary = nightly([str(wrong_log)], str(tmp_path / "out"))
     rows = read_table(str(tmp_path / "out"), "checks", NIGHT).to_pylist()
-    only_runs = ("lines_of_sight", "frames_all_night")  # a night has several sensors
+    # A night has several sensors, and stars.
+    only_runs = ("lines_of_sight", "frames_all_night", "centroid_sigma")
     rows = [row for row in rows if row["check"] not in only_runs]
     key = ("sensor_id", "check")
     rows = sorted(rows, key=lambda row: [row[name] for name in key])
     alone = as_dict(doctor([str(wrong_log)]))
+    alone["checks"] = [row for row in alone["checks"] if row["check"] not in only_runs]
     assert rows == sorted(alone["checks"], key=lambda row: [row[name] for name in key])
     assert summary.mistakes == alone["mistakes"]
     assert f"mistake     {summary.mistakes[0]}" in summary.lines()
@@ -85,6 +88,34 @@ def test_a_run_writes_the_same_checks_and_shows_mistakes(prefect, wrong_log, tmp
     assert unused["count"] > 20
     facts = read_night_facts(night_reader(str(tmp_path / "out"), NIGHT), "out")
     assert needs_look(facts)[0].sentence == summary.mistakes[0]
+
+
+@pytest.mark.parametrize(
+    ("stated_px", "sentence"),
+    [(1e-6, "stars scatter by 0.15 px, stated are 1e-06 px; "),
+     (10.0, "stars scatter by only 0.15 px, stated are 10 px; ")],
+)  # fmt: skip
+def test_errors_of_centroids_that_stars_contradict_are_named_and_not_used(
+    prefect, night_log, tmp_path, stated_px, sentence
+):
+    names = ["sat1", "sat2", "sat3", "sat4"]
+    wrong = rewritten(
+        centroid_sigma(stated_px)(read_log(night_log), names), tmp_path / "wrong.mcap"
+    )
+    summary = nightly([str(wrong)], str(tmp_path / "out"))
+    (mistake,) = summary.mistakes
+    assert mistake.startswith(f"{', '.join(names)}: {sentence}")
+    assert (summary.identified, summary.objects) == (summary.frames, 9)
+    assert evaluate(tmp_path / "out", night_log).nees_in_99 > 0.95
+
+
+def test_the_doctor_says_which_sensor_has_no_calibration(night_log, tmp_path):
+    log, copy = api.read_log(night_log), tmp_path / "a.mcap"
+    with pytest.warns(LogWarning, match="sat1: 60 frames and no valid calibration"):
+        api.write_log(copy, log.frames, log.states, log.cameras.filter(pl.col.sensor_id != "sat1"))
+    result = run("doctor", copy)
+    assert result.exit_code == 1
+    assert "write the calibration that `epipole calibrate` finds" in result.output
 
 
 def test_a_sound_night_has_no_wrong_check(night_dataset):

@@ -161,6 +161,17 @@ def magnitudes(log, names):
     return frames(log, names, flux=bright.cast(pl.List(pl.Float32)))
 
 
+def centroid_sigma(px):
+    """Return a mistake: all centroids have this error."""
+    sigma = pl.col("sigma_px").list.eval(pl.element() * 0 + px).cast(pl.List(pl.Float32))
+    return lambda log, names: frames(log, names, sigma_px=sigma)
+
+
+def without_camera(log, names):
+    rows = to_polars(log.cameras).filter(~of(names))
+    return log._replace(cameras=from_polars(CAMERAS, rows))
+
+
 NOTHING = times((1.0, 1.0))
 EARTH_FIXED = turned(False, "ITRF")  # no mistake
 
@@ -195,6 +206,11 @@ MISTAKES = {
         "image_too_small",
     ),
     "magnitudes as flux": (magnitudes, "flux_is_magnitude"),
+    "errors of centroids in radians": (centroid_sigma(1e-4), "impossible_centroid_sigma"),
+    "exposures in ms": (
+        lambda log, n: frames(log, n, exposure_s=pl.lit(200.0)), "exposure_too_long",
+    ),
+    "no calibration": (without_camera, "no_calibration"),
     "two sensors with one id": (one_id, "two_sensors"),
     # What states and frames alone do not show.
     "GCRF as TEME": (lambda log, n: states(log, n, frame=pl.lit("TEME")), None),

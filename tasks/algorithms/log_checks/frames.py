@@ -7,7 +7,10 @@ import numpy as np
 from epipole.schemas.arrays import Array, Integers, Nanoseconds
 from epipole.tasks.algorithms.constants import SECOND_NS
 from epipole.tasks.algorithms.log_checks.findings import (
+    CALIBRATION,
+    CENTROID_SIGMA,
     COVERAGE,
+    EXPOSURE_TIME,
     FLUX,
     FRAME_TIMES,
     FRAMES_ALL_NIGHT,
@@ -37,7 +40,14 @@ MAGNITUDES = (-5.0, 20.0)
 # Where the median lies between the smallest and the largest: faint stars are many. Half of them
 # are within a magnitude of the limit; of linear fluxes the median is near the smallest.
 MAGNITUDE_SHARE = 0.4
+# Median exposure over the median time from frame to frame: exposures of some cameras last until the
+# next one begins, and intervals vary.
+LONGEST_EXPOSURE = 1.2
 OUTSIDE = 0.02  # share of centroids outside the image
+LEAST_SIGMA_PX = 0.001  # stated error of a centroid that no camera reaches: a run ignores less
+# Scatter of stars over stated errors, either way, that is a mistake: photons alone may be a third
+# of the error, and a run scales errors by itself. Degrees of freedom of residuals that show it.
+SIGMA_RATIO, MIN_SCATTER_DOF = 5.0, 20
 REACH = 0.45  # of a side that no centroid exceeds: the image is larger than stated, or smaller
 
 
@@ -48,8 +58,10 @@ class LogFrames(NamedTuple):
         One frame of each time.
     all_numbers : (k,) int
         Of all frames in order of time, also where several have one time.
-    x_px, y_px, flux : (m,) float
-        Centroids of some of the frames; flux is NaN where unknown.
+    x_px, y_px, flux, sigma_px : (m,) float
+        Centroids of some of the frames; flux and sigma_px only those that are known, (k,) each.
+    exposure_s : (s,) float
+        Exposure times of these frames; 0 is unknown.
     """
 
     time_ns: Nanoseconds
@@ -58,6 +70,8 @@ class LogFrames(NamedTuple):
     x_px: Array
     y_px: Array
     flux: Array
+    sigma_px: Array
+    exposure_s: Array
 
 
 class LogCamera(NamedTuple):
@@ -80,9 +94,16 @@ def check_frames(
         return []
     found = [check_times(frames), *check_coverage(frames.time_ns, state_ns, state_gap_s)]
     found += check_numbers(frames, camera)
-    if camera is not None:
+    if not found or found[-1].verdict != WRONG:
+        found += check_exposures(frames)
+    if camera is None:
+        facts = {"frames": float(len(frames.time_ns))}
+        found.append(
+            Finding(CALIBRATION, WRONG, 0.0, expected=1.0, cause="no_calibration", facts=facts)
+        )
+    else:
         found += [check_principal_point(camera), check_image_size(frames, camera)]
-    return [*found, check_flux(frames.flux)]
+    return [*found, check_flux(frames.flux), check_stated_sigma(frames.sigma_px)]
 
 
 def check_times(frames: LogFrames) -> Finding:
@@ -219,6 +240,55 @@ def check_numbers(frames: LogFrames, camera: LogCamera | None) -> list[Finding]:
     if back < MIN_BACKWARD or not (steps > 0).any():
         return []
     return [Finding(ONE_SENSOR, WRONG, back, expected=0.0, cause="numbers_alternate", facts=facts)]
+
+
+def check_exposures(frames: LogFrames) -> list[Finding]:
+    """Return whether exposures end before the next frame; none where they are unknown."""
+    known = frames.exposure_s[frames.exposure_s > 0]
+    if not len(known) or len(frames.time_ns) < MIN_FRAMES:
+        return []
+    exposure_s = float(np.median(known))
+    interval_s = float(np.median(np.diff(frames.time_ns))) / SECOND_NS
+    facts = {"exposure_s": exposure_s, "interval_s": interval_s}
+    found = Finding(EXPOSURE_TIME, SOUND, exposure_s / interval_s, facts=facts)
+    if exposure_s > LONGEST_EXPOSURE * interval_s:
+        return [found._replace(verdict=WRONG, cause="exposure_too_long")]
+    return [found]
+
+
+def check_stated_sigma(sigma_px: Array) -> Finding:
+    """Return whether the stated errors of centroids are possible; only stars show the true ones."""
+    if not len(sigma_px):
+        return Finding(CENTROID_SIGMA, UNKNOWN, unit="px", cause="no_centroid_sigma")
+    found = Finding(CENTROID_SIGMA, UNKNOWN, float(np.median(sigma_px)), unit="px")
+    if found.value < LEAST_SIGMA_PX:
+        return found._replace(verdict=WRONG, cause="impossible_centroid_sigma")
+    return found._replace(cause="centroid_sigma_uncompared")
+
+
+def check_star_scatter(
+    dx_px: Array, dy_px: Array, sigma_px: Array, n_frames: int
+) -> Finding | None:
+    """Return whether stated errors are those that stars show; None for too few stars.
+
+    Parameters
+    ----------
+    dx_px, dy_px, sigma_px
+        (n,) residuals of stars and their stated errors.
+    n_frames
+        Frames of which the attitude was fitted to these stars.
+    """
+    dof = 2 * len(dx_px) - 3 * n_frames
+    if dof < MIN_SCATTER_DOF:
+        return None
+    scatter_px = float(np.sqrt((dx_px @ dx_px + dy_px @ dy_px) / dof))
+    stated_px = float(np.sqrt(np.mean(sigma_px**2)))
+    found = Finding(CENTROID_SIGMA, SOUND, scatter_px, expected=stated_px, unit="px")
+    if scatter_px > SIGMA_RATIO * stated_px:
+        return found._replace(verdict=WRONG, cause="centroid_sigma_too_small")
+    if stated_px > SIGMA_RATIO * scatter_px:
+        return found._replace(verdict=WRONG, cause="centroid_sigma_too_large")
+    return found
 
 
 def check_principal_point(camera: LogCamera) -> Finding:

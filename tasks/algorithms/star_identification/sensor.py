@@ -79,6 +79,9 @@ STARS_PER_CENTROID, ASSUMED_IN_VIEW = 1.2, 10.0
 BRIGHTER_MAG, MIN_IN_VIEW = (1.0, 2.0), 5.0
 # Centroid errors that are tried: factors on stated ones, or pixels where none are stated.
 KNOWN_SCALES, UNKNOWN_SCALES_PX = (1.0, 3.0, 0.4), (0.5, 1.5, 0.15)
+# Median of stated errors [px] that `KNOWN_SCALES` correct: from a third of the least error of a
+# camera to the blur of a lens. Beyond, the pixels of unknown errors are tried too.
+CREDIBLE_PX = (0.02, 3.0)
 # Relative error of the learned centroid error above which all frames are matched again. With half
 # or twice of it the same frames are identified, and squared errors over covariance change by 0.03.
 WRONG_GATE = 0.02
@@ -205,7 +208,7 @@ def _probe(
         limit = _assumed_limit(centroids, typical, crowded, skies)
     first = SensorModel(1.0, limit, magnitude_limit is None, matching, True, not stated)
     rows = usable[aperiodic_rows(len(usable), PROBED_CROWDED if crowded else PROBED)]
-    scales = KNOWN_SCALES if stated else UNKNOWN_SCALES_PX
+    scales = _tried_scales(centroids, stated)
     # The groups of a crowd are searched sooner than its frames; most other frames need none.
     if typical > MANY and not _are_stars(frames.take(rows[:FIRST]), skies, first, scales[0]):
         frames = _anchored_by_motion(frames, rows, skies, first, scales)
@@ -216,6 +219,16 @@ def _probe(
             frames = anchored
             model, solutions = _first_scale(frames.take(rows), skies, first, scales, crowded)
     return frames, model, _Probe(rows, solutions, usable)
+
+
+def _tried_scales(centroids: RawCentroids, stated: bool) -> tuple[float, ...]:
+    """Return the factors on centroid errors that are tried, the likeliest first."""
+    if not stated:
+        return UNKNOWN_SCALES_PX
+    stated_px = float(np.nanmedian(centroids.sigma_px))
+    if CREDIBLE_PX[0] <= stated_px <= CREDIBLE_PX[1]:
+        return KNOWN_SCALES
+    return (*KNOWN_SCALES, *(scale_px / stated_px for scale_px in UNKNOWN_SCALES_PX))
 
 
 def _are_stars(frames: FrameSample, skies: Skies, model: SensorModel, scale: float) -> bool:

@@ -9,7 +9,8 @@ from epipole.io.logs.reader import read_log
 from epipole.schemas.log_checks import LISTED, CheckVerdict, LogCause, LogCheck, mistakes
 from epipole.tasks.algorithms.log_checks import findings
 from epipole.tasks.algorithms.log_checks.findings import WRONG, Finding
-from epipole.tasks.read.judge_sensor import checks_table, judge_log
+from epipole.tasks.read import judge_sensor
+from epipole.tasks.read.judge_sensor import checks_table, judge_log, rows_by_sensor
 
 ROOT = Path(__file__).parents[3]
 SHARED = Path(__file__).resolve().parents[4] / "shared" / "data"
@@ -81,7 +82,7 @@ def test_all_checks_and_causes_are_declared_and_have_a_sentence(sound):
                            "lead_s", "trail_s", "cx_px", "cy_px", "width", "height", "x_px",
                            "y_px", "low", "high", "offset_s", "share_percent", "odds", "lost_s",
                            "length_s", "known", "tracklets", "as_written", "within_s",
-                           "sigma_s", "exposure_s", "frames"),
+                           "sigma_s", "exposure_s", "frames", "interval_s"),
                           3.0)  # fmt: skip
     rows = [Finding(LogCheck.VELOCITY, cause.verdict, 1.0, 2.0, 3.0, "", cause.value, facts)
             for cause in LogCause]  # fmt: skip
@@ -101,3 +102,21 @@ def test_one_sentence_names_the_sensors_of_a_mistake():
 def test_sensors_without_anything_have_no_rows():
     assert checks_table({}).num_rows == 0
     assert checks_table({"a": []}).num_rows == 0
+
+
+def test_rows_of_all_sensors_are_found_in_one_pass(sound):
+    rows = rows_by_sensor(sound.exposures)
+    names = sound.exposures["sensor_id"].to_pylist()
+    assert {name: k.tolist() for name, k in rows.items()} == {
+        name: [k for k, each in enumerate(names) if each == name] for name in set(names)
+    }
+    assert rows_by_sensor(sound.exposures.slice(0, 0)) == {}
+
+
+def test_the_columns_of_a_log_are_searched_once_and_not_per_sensor(sound, monkeypatch):
+    calls = []
+    monkeypatch.setattr(
+        judge_sensor, "rows_by_sensor", lambda rows: calls.append(rows) or rows_by_sensor(rows)
+    )
+    assert judge_log(sound, GAP_S).num_rows
+    assert len(calls) == 2

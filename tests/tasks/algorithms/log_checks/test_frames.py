@@ -8,12 +8,14 @@ from epipole.tasks.algorithms.log_checks.frames import (
     LogCamera,
     LogFrames,
     check_coverage,
+    check_exposures,
     check_flux,
     check_frames,
     check_image_size,
     check_night,
     check_numbers,
     check_principal_point,
+    check_star_scatter,
     check_times,
     known_offset,
 )
@@ -32,7 +34,7 @@ def frames(t_s, number=None, **more):
     time_ns = ns(t_s)
     number = np.arange(len(time_ns)) if number is None else np.asarray(number)
     used = np.diff(time_ns, prepend=0) > 0
-    empty = {"x_px": np.zeros(0), "y_px": np.zeros(0), "flux": np.zeros(0)}
+    empty = dict.fromkeys(("x_px", "y_px", "flux", "sigma_px", "exposure_s"), np.zeros(0))
     return LogFrames(time_ns[used], number[used], number, **empty | more)
 
 
@@ -156,3 +158,26 @@ def test_a_sensor_without_frames_for_a_part_of_the_night_is_found(kept, lost, lo
     if longest:
         assert (found.facts["from_s"], found.facts["to_s"]) == longest
     assert check_night(time_ns[:0], 0, int(time_ns[-1]), 0.02) is None
+
+
+@pytest.mark.parametrize(("exposure_s", "verdict"), [(0.9, SOUND), (1.0, SOUND), (200.0, WRONG)])
+def test_exposures_end_before_the_next_frame(exposure_s, verdict):
+    (found,) = check_exposures(frames(np.arange(30.0), exposure_s=np.full(9, exposure_s)))
+    assert found.verdict == verdict
+
+
+def test_exposures_that_are_unknown_are_not_judged():
+    assert check_exposures(frames(np.arange(30.0), exposure_s=np.zeros(9))) == []
+
+
+@pytest.mark.parametrize(
+    ("stated_px", "cause"),
+    [(0.1, ""), (0.3, ""), (0.03, ""), (1e-3, "centroid_sigma_too_small"),
+     (2.0, "centroid_sigma_too_large")],
+)  # fmt: skip
+def test_stated_errors_are_held_against_the_scatter_of_stars(stated_px, cause):
+    dx, dy = np.random.default_rng(0).normal(0, 0.1, (2, 400))
+    found = check_star_scatter(dx, dy, np.full(400, stated_px), 20)
+    assert found.cause == cause
+    assert found.value == pytest.approx(0.1, rel=0.1)
+    assert check_star_scatter(dx[:9], dy[:9], np.full(9, stated_px), 1) is None

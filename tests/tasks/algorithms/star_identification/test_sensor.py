@@ -57,6 +57,13 @@ def test_the_centroid_error_is_found_whether_stated_wrongly_or_not_at_all(sigma_
     assert found.sigma_scale * (stated_px if stated else 1.0) == pytest.approx(sigma_px, rel=0.08)
 
 
+@pytest.mark.parametrize("stated_px", [1e-4, 0.003, 10.0, 1000.0])
+def test_errors_that_no_camera_has_are_replaced_by_those_that_stars_show(stated_px):
+    found = _identify([_shot(k, 0.1, stated_px, n_false=5)[0] for k in range(25)])
+    assert found.solutions.solved.sum() >= 24
+    assert found.sigma_scale * stated_px == pytest.approx(0.1, rel=0.08)
+
+
 def test_stars_and_attitudes_are_the_true_ones_among_many_false_points():
     centroids, true = zip(*[_shot(k, 0.3, n_false=30, missing=0.1) for k in range(25)], strict=True)
     found = _identify(list(centroids))
