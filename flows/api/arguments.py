@@ -4,9 +4,12 @@ import datetime
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
-from epipole.schemas.arrays import Array
+from epipole.io.logs.messages.cameras import optics_fault
+from epipole.schemas.arrays import Array, Integers
 from epipole.schemas.log_bounds import QUATERNION, SPEED
+from epipole.tasks.algorithms.geometry.camera import Camera
 
 Time = datetime.datetime | np.datetime64 | str | int
 
@@ -25,6 +28,10 @@ def floats(
         Names the argument, its shape and the shape that is expected.
     """
     lengths = [n if isinstance(n, int) else None for n in shape]
+    if np.ma.is_masked(values):
+        raise ValueError(
+            f"{name}: has {np.ma.count_masked(values)} masked values; leave them out, or fill them"
+        )
     if values is None and default is not None:
         return np.full([n or 0 for n in lengths], default)
     try:
@@ -44,6 +51,48 @@ def floats(
         wanted = ", ".join(map(str, shape)) + ("," if len(shape) == 1 else "")
         raise ValueError(f"{name}: has shape {given}, expected ({wanted})")
     return out
+
+
+def integers(name: str, values: Any, n: int) -> Integers:
+    """Return values as (n,) integers.
+
+    Raises
+    ------
+    ValueError
+        Where one is not whole, or the shape is wrong.
+    """
+    given = floats(name, values, n)
+    out = np.asarray(values)
+    if out.dtype.kind not in "iu" and not (given == np.rint(given)).all():
+        wrong = given[~(given == np.rint(given))][0]
+        raise ValueError(f"{name}: has {wrong:g}, expected whole numbers")
+    return out.astype(np.int64) if out.dtype.kind in "iu" else given.astype(np.int64)
+
+
+def optics(name: str, camera: Any) -> Camera:
+    """Return a camera that a log may have.
+
+    Raises
+    ------
+    ValueError
+        Where it has other fields, or numbers that a log would be refused for.
+    """
+    try:
+        given = Camera(*camera)
+        numbers = [float(value) for value in given]
+    except (TypeError, ValueError) as error:
+        fields = ", ".join(Camera._fields)
+        raise ValueError(f"{name}: is no Camera of numbers {fields} ({error})") from error
+    width, height, fx, fy, cx, cy, *distortion, _, line_time_s = numbers
+    if width % 1 or height % 1:
+        raise ValueError(f"{name}: width and height are {width:g} and {height:g}, expected whole")
+    K = (fx, 0.0, cx, 0.0, fy, cy, 0.0, 0.0, 1.0)
+    fault = optics_fault(
+        (int(width), int(height)), K, tuple(distortion), bool(given.fisheye), line_time_s
+    )
+    if fault is not None:
+        raise ValueError(f"{name}: {fault.value}: {fault.sentence} It is {given}")
+    return given
 
 
 def unit_quaternion(name: str, q: Array) -> Array:
@@ -77,6 +126,24 @@ def velocity(velocity_km_s: Any, default: float | None = None) -> Array:
     return v
 
 
+def nanoseconds(name: str, times: Any) -> npt.NDArray[np.int64]:
+    """Return numpy.datetime64 of any unit as integer nanoseconds since 1970, UTC.
+
+    Raises
+    ------
+    ValueError
+        Where one is beyond what nanoseconds can hold, the years 1678 to 2261.
+    """
+    given = np.asarray(times)
+    at_ns = given.astype("datetime64[ns]")
+    # Years, compared as such: a cast to nanoseconds wraps silently.
+    year, cast = (values.astype("datetime64[Y]") for values in (given, at_ns))
+    wrapped = (year != cast) & ~np.isnat(given)
+    if wrapped.any():
+        raise ValueError(f"{name}: {given[wrapped].flat[0]} is beyond the years 1678 to 2261")
+    return np.asarray(at_ns.astype(np.int64))
+
+
 def time_ns(time: Time) -> int:
     """Return a time as integer nanoseconds since 1970, UTC. A time without a zone is UTC.
 
@@ -95,7 +162,8 @@ def time_ns(time: Time) -> int:
             since = time.replace(tzinfo=zone) - datetime.datetime(1970, 1, 1, tzinfo=datetime.UTC)
             return int(np.int64((since // datetime.timedelta(microseconds=1)) * 1000))
         if isinstance(time, np.datetime64) and not np.isnat(time):
-            return int(time.astype("datetime64[ns]").astype(np.int64))
+            return int(nanoseconds("time", time))
     except (ValueError, OverflowError) as error:
-        raise ValueError(f"time: {error}") from error
+        said = str(error).removeprefix("time: ")
+        raise ValueError(f"time: {said}") from error
     raise ValueError(f"time: {time!r} is not a time; give a datetime, or nanoseconds since 1970")

@@ -9,6 +9,7 @@ import pyarrow as pa
 from epipole.flows.api.arguments import (
     Time,
     floats,
+    optics,
     time_ns,
     unit_quaternion,
     velocity,
@@ -113,7 +114,8 @@ def identify_frame(
     Raises
     ------
     ValueError
-        Where arrays differ in length, or a value is not a number.
+        Where arrays differ in length, a value is not a number, or a log with this camera would be
+        refused.
 
     Notes
     -----
@@ -157,8 +159,8 @@ def identify_frame(
         SENSOR_STATES_AT_FRAMES, at_ns, **{name: nullable(v) for name, v in state.items()}
     )
     covariance = unstack_covariance("cov_{}", np.zeros((1, 9, 9)), OPTICS_AXES)
-    optics = {name: [value] for name, value in Camera(*camera)._asdict().items()}
-    cameras = _one_row(CAMERAS, at_ns, **optics, **covariance)
+    columns = {name: [value] for name, value in optics("camera", camera)._asdict().items()}
+    cameras = _one_row(CAMERAS, at_ns, **columns, **covariance)
     settings = settings or Settings()
     catalogue = read_star_catalogue(settings.identification.catalogue)
     made = identify_stars(
@@ -228,7 +230,8 @@ def view_frame(
     Raises
     ------
     ValueError
-        Where a shape is wrong, or the attitude is not of length 1, as where it is unknown.
+        Where a shape is wrong, a log with this camera would be refused, or the attitude is not of
+        length 1, as where it is unknown.
 
     Examples
     --------
@@ -243,8 +246,9 @@ def view_frame(
     """
     x = floats("x_px", x_px, "n")
     n = len(x)
-    u = unproject(Camera(*camera), x, floats("y_px", y_px, n))
-    sigma_rad = floats("sigma_px", sigma_px, n, repeat=True) * pixel_angle(Camera(*camera), u)
+    camera = optics("camera", camera)
+    u = unproject(camera, x, floats("y_px", y_px, n))
+    sigma_rad = floats("sigma_px", sigma_px, n, repeat=True) * pixel_angle(camera, u)
     attitude = unit_quaternion("attitude_xyzw", floats("attitude_xyzw", attitude_xyzw, 4))
     R = matrix_from_quaternion(attitude[None])[0]
     apparent = u @ R
@@ -258,5 +262,5 @@ def view_frame(
         floats("position_km", position_km, 3),
         float(position_sigma_km),
         attitude,
-        Camera(*camera),
+        camera,
     )

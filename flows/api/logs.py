@@ -3,8 +3,8 @@
 import heapq
 import os
 import warnings
-from collections.abc import Iterator
-from typing import Any, NamedTuple
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any, NamedTuple, TypeAlias
 
 import polars as pl
 import pyarrow as pa
@@ -51,12 +51,15 @@ class LogTables(NamedTuple):
     rejects: pl.DataFrame
 
 
+Table: TypeAlias = pl.DataFrame | pl.LazyFrame | pa.Table | Mapping[str, Any]
+
 _FRAMES = pa.schema([f for f in EXPOSURES if f.name not in ("source", "offset")],
                     {"table": "frames"})  # fmt: skip
 _UNKNOWN_IS_0 = ("position_sigma_km", "attitude_sigma_arcsec")
 _STATES = pa.schema([f.with_nullable(f.nullable or f.name in _UNKNOWN_IS_0) for f in SENSOR_STATES],
                     {"table": "states"})  # fmt: skip
 _CAMERAS = pa.schema([f for f in CAMERAS if not f.name.startswith("cov_")], {"table": "cameras"})
+_VECTORS = (("vx_km_s", "vy_km_s", "vz_km_s"), ("qx", "qy", "qz", "qw"))  # null or whole
 # What a column has that is left out.
 _DEFAULTS: dict[str, Any] = {
     "exposure_s": 0.0, "flux": None, "sigma_px": None,
@@ -107,9 +110,9 @@ def read_log(path: str | os.PathLike[str]) -> LogTables:
 
 def write_log(
     path: str | os.PathLike[str],
-    frames: pl.DataFrame,
-    states: pl.DataFrame,
-    cameras: pl.DataFrame,
+    frames: Table,
+    states: Table,
+    cameras: Table,
     *,
     encoding: str = "protobuf",
 ) -> None:
@@ -120,7 +123,8 @@ def write_log(
     path
         The MCAP file to write. It gets its name when it is complete.
     frames, states, cameras
-        Tables with the columns that `LogTables` names, in any order of rows. These columns may be
+        Polars or Arrow tables, or columns by name, as `LogTables` has them, in any order of rows.
+        These columns may be
         left out: `exposure_s`, `flux`, `sigma_px`; velocities, sigmas and attitudes of states;
         distortions `k1`, `k2`, `p1`, `p2`, `k3`, `k4`, `fisheye` and `line_time_s` of cameras.
         Times are UTC, positions GCRF. A sensor's id has 1 to 63 letters of A-Z and a-z, digits, -
@@ -131,7 +135,8 @@ def write_log(
     Raises
     ------
     ValueError
-        Where a column is missing, unknown, of the wrong type, or null where it may not be; where
+        Where a column is missing, unknown, of the wrong type, or null where it may not be; where a
+        velocity or an attitude has a part of its components; where
         the lists of a frame differ in length; where a sensor's id is invalid;
         where the encoding is unknown.
 
@@ -170,8 +175,29 @@ def _found_in(path: str | os.PathLike[str]) -> Iterator[str]:
     yield from (f"rejects of a reader: {each}" for each in left_out(log.rejects))
 
 
-def _checked(schema: pa.Schema, rows: pl.DataFrame) -> pl.DataFrame:
+def _frame(schema: pa.Schema, rows: Any) -> pl.DataFrame:
+    """Return a table of any common kind as a frame."""
+    name = table_name(schema)
+    try:
+        if isinstance(rows, pl.LazyFrame):
+            rows = rows.collect()
+        elif isinstance(rows, pa.Table):
+            rows = to_polars(rows)
+        elif isinstance(rows, Mapping):
+            rows = pl.DataFrame(rows)
+    except (TypeError, pl.exceptions.PolarsError) as error:
+        raise ValueError(f"table {name}: cannot be made of these columns: {error}") from error
+    if not isinstance(rows, pl.DataFrame):
+        raise TypeError(
+            f"table {name}: is a {type(rows).__name__}, expected a polars DataFrame or LazyFrame, "
+            "an Arrow table or columns by name"
+        )
+    return rows
+
+
+def _checked(schema: pa.Schema, rows: Any) -> pl.DataFrame:
     """Return the rows with all columns of the schema, in order of time."""
+    rows = _frame(schema, rows)
     columns: dict[str, Any] = {name: rows[name].to_arrow() for name in rows.columns}
     for name in schema.names:
         if name not in columns and name in _DEFAULTS:
@@ -183,6 +209,8 @@ def _checked(schema: pa.Schema, rows: pl.DataFrame) -> pl.DataFrame:
                 f"table {table_name(schema)}: sensor_id {sensor_id!r}: expected {SENSOR_ID_RULE}"
             )
     _check_written(table_name(schema), checked)
+    for names in _VECTORS if schema is _STATES else ():
+        _check_whole(names, checked)
     unknown = [pl.col(name).fill_null(0.0) for name in _UNKNOWN_IS_0 if name in schema.names]
     return checked.with_columns(unknown).sort("time", "sensor_id", maintain_order=True)
 
@@ -197,6 +225,19 @@ def _check_written(name: str, rows: pl.DataFrame) -> None:
             raise ValueError(
                 f"table {name}: {column} of {sensor_id} is {value}, expected {lowest} or later"
             )
+
+
+def _check_whole(names: Sequence[str], states: pl.DataFrame) -> None:
+    """Raise where a vector has a part of its components."""
+    missing = pl.sum_horizontal(pl.col(name).is_null() for name in names)
+    partly = states.filter((missing > 0) & (missing < len(names)))
+    if partly.height:
+        row = partly.row(0, named=True)
+        absent = ", ".join(name for name in names if row[name] is None)
+        raise ValueError(
+            f"table states: {absent} of {row['sensor_id']} is null in {partly.height} rows that "
+            f"have the rest of {', '.join(names)}; give all of them or none"
+        )
 
 
 def _same_lengths(frames: pl.DataFrame) -> pl.DataFrame:
@@ -228,9 +269,9 @@ def _write(log: LogWriter, kind: str, time_ns: int, row: dict[str, Any]) -> None
             sensor_id,
             time_ns,
             position_km=[row[name] for name in ("x_km", "y_km", "z_km")],
-            velocity_km_s=_vector(row, "vx_km_s", "vy_km_s", "vz_km_s"),
+            velocity_km_s=_vector(row, *_VECTORS[0]),
             position_sigma_km=row["position_sigma_km"],
-            attitude_xyzw=_vector(row, "qx", "qy", "qz", "qw"),
+            attitude_xyzw=_vector(row, *_VECTORS[1]),
             attitude_sigma_arcsec=row["attitude_sigma_arcsec"],
         )
 

@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from epipole.flows.api.arguments import floats
+from epipole.flows.api.arguments import floats, integers, optics
 from epipole.schemas.arrays import Array, Flags, Indices
 from epipole.schemas.settings import Settings
 from epipole.tasks.algorithms.association.samples import Samples
@@ -14,6 +14,8 @@ from epipole.tasks.algorithms.geometry import triangulation
 from epipole.tasks.algorithms.geometry.camera import Camera
 from epipole.tasks.algorithms.geometry.directions import matrix_from_quaternion
 from epipole.tasks.solve.associate_objects import associate_by_likelihood
+
+SPARSE = 100  # rows of a result per direction: with more, objects are not numbered from 0 on
 
 
 class View(NamedTuple):
@@ -179,8 +181,8 @@ def triangulate(
     views : sequence of View
         One view per sensor, all of the same instant.
     objects : sequence of (n,) int, optional
-        For each view, the object of each direction, as `associate` returns them; -1: none. None:
-        every view has one direction, and all show one object.
+        For each view, the object of each direction, as `associate` returns them, numbered from 0
+        on; -1: none. None: every view has one direction, and all show one object.
     velocity_km_s : (g, 3) float, optional
         Velocity of each object, GCRF: light to a farther sensor left earlier. None: 0, which is
         right for sensors at similar ranges.
@@ -195,7 +197,7 @@ def triangulate(
     Raises
     ------
     ValueError
-        Where a shape is wrong.
+        Where a shape is wrong, or numbers of objects are not whole, or far above their count.
 
     References
     ----------
@@ -254,7 +256,7 @@ def _checked(k: int, view: View) -> View:
         floats(name + "position_km", view.position_km, 3),
         float(view.position_sigma_km),
         None if attitude is None else floats(name + "attitude_xyzw", attitude, 4),
-        view.camera,
+        None if view.camera is None else optics(name + "camera", view.camera),
     )
 
 
@@ -271,10 +273,17 @@ def _labels(views: Sequence[View], objects: Sequence[npt.ArrayLike] | None) -> I
     if len(objects) != len(views):
         raise ValueError(f"objects: has {len(objects)} entries, expected {len(views)}, one a view")
     labels = [
-        floats(f"objects[{k}]", of, len(view.u_icrs))
+        integers(f"objects[{k}]", of, len(view.u_icrs))
         for k, (of, view) in enumerate(zip(objects, views, strict=True))
     ]
-    return _joined(labels).astype(np.int64)
+    joined = np.concatenate([np.zeros(0, np.int64), *labels])
+    largest, n = int(joined.max(initial=-1)), len(joined)
+    if largest >= SPARSE * max(n, 100):
+        raise ValueError(
+            f"objects: has {largest} for {n} directions, and the result has a row per number up "
+            "to the largest; number the objects from 0 on (numpy.unique with return_inverse)"
+        )
+    return joined
 
 
 def _joined(arrays: Sequence[Array], *shape: int) -> Array:

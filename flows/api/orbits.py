@@ -6,7 +6,7 @@ import numpy as np
 import numpy.typing as npt
 import polars as pl
 
-from epipole.flows.api.arguments import Time, floats, time_ns
+from epipole.flows.api.arguments import Time, floats, nanoseconds, time_ns
 from epipole.schemas.arrays import Array, Flags
 from epipole.schemas.columns import ELEMENTS
 from epipole.schemas.settings import Settings
@@ -150,8 +150,9 @@ def attributable(
     >>> np.sqrt(np.diag(found.cov_arcsec2)).round(2).tolist()
     [0.62, 0.52, 0.16, 0.16]
     """
-    times = np.atleast_1d(np.asarray(time, NS))
-    at_ns, n = times.astype(np.int64), len(times)
+    times = np.atleast_1d(np.asarray(time))
+    times = times if times.dtype.kind == "M" else times.astype(NS)
+    at_ns, n = nanoseconds("time", times), len(times)
     if not n or np.isnat(times).any() or (np.diff(at_ns) < 0).any():
         raise ValueError("time: has no times, or NaT, or they are not in order")
     ra, dec = (

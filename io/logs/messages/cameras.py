@@ -111,6 +111,32 @@ def _camera_fault(calibration: CalibrationMessage) -> Reason | None:
     return _optics_fault(sides, tuple(calibration.K.tolist()), _coefficients(calibration), fisheye)
 
 
+def optics_fault(
+    sides: tuple[int, int], K: tuple[float, ...], D: tuple[float, ...], fisheye: bool,
+    line_time_s: float,
+) -> Reason | None:  # fmt: skip
+    """Return why a log with these optics would be refused; None where it would not.
+
+    Parameters
+    ----------
+    sides
+        Width and height [px].
+    K
+        Camera matrix, row by row.
+    D
+        Distortion k1, k2, p1, p2, k3, k4.
+    line_time_s
+        Time from row to row.
+    """
+    if any(side not in IMAGE_SIDE for side in sides):
+        return IMAGE_SIDE.reason
+    if not np.isfinite(D).all():
+        return Reason.BAD_DISTORTION
+    if line_time_s not in LINE_TIME:
+        return LINE_TIME.reason
+    return _optics_fault(sides, K, D, fisheye)
+
+
 @lru_cache(maxsize=256)
 def _optics_fault(
     sides: tuple[int, int], K: tuple[float, ...], D: tuple[float, ...], fisheye: bool

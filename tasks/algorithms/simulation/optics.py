@@ -63,17 +63,34 @@ def on_image(optics: TrueOptics, x_px: Array, y_px: Array) -> Flags:
 
 
 def field_radius(optics: TrueOptics) -> float:
-    """Return the angle [rad] from the boresight to the farthest corner, plus 1 %."""
+    """Return the angle [rad] from the boresight to the farthest corner, plus 1 %.
+
+    Of a lens that folds before the corners it is the angle where it folds: farther directions have
+    the pixel positions of nearer ones.
+    """
     columns = np.linspace(-0.5, optics.width - 0.5, 9)
     rows = np.linspace(-0.5, optics.height - 0.5, 9)
     x, y = (v.ravel() for v in np.meshgrid(columns, rows))
     x, y = (x - optics.cx_px) / optics.fx_px, (y - optics.cy_px) / optics.fy_px
-    wanted_x, wanted_y = x, y
+    wanted_x, wanted_y, fold = x, y, _fold_radius(optics)
     for _ in range(30):  # a fixed-point iteration: the distortion is small
         got_x, got_y = bend(optics, x, y)
         x, y = x + wanted_x - got_x, y + wanted_y - got_y
+        shrink = np.minimum(1.0, fold / np.maximum(np.hypot(x, y), 1e-12))
+        x, y = x * shrink, y * shrink
     farthest = float(np.max(np.hypot(x, y)))
-    return (farthest if optics.fisheye else float(np.arctan(farthest))) * 1.01 + 1e-4
+    angle = farthest if optics.fisheye else float(np.arctan(farthest))
+    folds = farthest > fold * (1 - 1e-9)
+    return angle if folds else angle * 1.01 + 1e-4
+
+
+def _fold_radius(optics: TrueOptics) -> float:
+    """Return the undistorted radius from which on the radial distortion folds the image."""
+    # The slope of the distorted radius, a polynomial in the squared radius.
+    slope = [9 * optics.k4, 7 * optics.k3, 5 * optics.k2, 3 * optics.k1, 1.0]
+    roots = np.roots(slope)
+    real = roots.real[(np.abs(roots.imag) < 1e-12) & (roots.real > 0)]
+    return float(np.sqrt(real.min())) if len(real) else np.inf
 
 
 # Lines of sight: light time, aberration, and the Earth in between.

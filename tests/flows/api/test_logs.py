@@ -118,6 +118,30 @@ def test_wrong_tables_are_named(tmp_path, change, message):
     assert not list(tmp_path.iterdir())
 
 
+def test_tables_may_be_lazy_or_arrow_or_columns_by_name(tmp_path):
+    frames, states, cameras = tables()
+    api.write_log(tmp_path / "a.mcap", frames, states, cameras)
+    api.write_log(tmp_path / "b.mcap", frames.lazy(), states.to_arrow(), cameras.to_dict())
+    first, second = (api.read_log(tmp_path / f"{name}.mcap") for name in "ab")
+    assert all(one.equals(other) for one, other in zip(first[:3], second[:3], strict=True))
+    with pytest.raises(TypeError, match="table states: is a list, expected a polars DataFrame"):
+        api.write_log(tmp_path / "c.mcap", frames, [1], cameras)
+    with pytest.raises(ValueError, match="table states: cannot be made of these columns"):
+        api.write_log(tmp_path / "c.mcap", frames, {"time": [1, 2], "x_km": [1]}, cameras)
+
+
+@pytest.mark.parametrize(
+    ("names", "absent"),
+    [(("vx_km_s", "vy_km_s", "vz_km_s"), "vy_km_s"), (("qx", "qy", "qz", "qw"), "qw")],
+)
+def test_a_vector_with_a_part_of_its_components_is_refused(tmp_path, names, absent):
+    frames, states, cameras = tables()
+    states = states.with_columns(pl.lit(0.5).alias(name) for name in names)
+    states = states.with_columns(pl.lit(None, pl.Float64).alias(absent))
+    with pytest.raises(ValueError, match=f"table states: {absent} of a is null in 1 rows"):
+        api.write_log(tmp_path / "a.mcap", frames, states, cameras)
+
+
 def test_missing_columns_are_named(tmp_path):
     frames, states, cameras = tables()
     with pytest.raises(ValueError, match=r"table frames: missing columns \['x_px'\]"):

@@ -100,3 +100,11 @@ def test_wrong_labels_are_named():
         api.triangulate(views, [[0], *who[1:]])
     with pytest.raises(ValueError, match=r"velocity_km_s: has shape \(3,\), expected \(8, 3\)"):
         api.triangulate(views, who, velocity_km_s=[0.0, 0.0, 0.0])
+
+
+def test_objects_that_are_not_numbered_from_0_on_are_refused():
+    view = api.View([[1.0, 0.0, 0.0]], 1e-12 * np.eye(2), [7000.0, 0.0, 0.0])
+    for label, message in ((10_000_000, "number the objects from 0 on"), (0.5, "expected whole")):
+        with pytest.raises(ValueError, match=message):
+            api.triangulate([view, view], [[label], [label]])
+    assert api.triangulate([view, view], [[12], [12]]).r_gcrf_km.shape == (13, 3)
