@@ -26,6 +26,7 @@ from epipole.tasks.algorithms.orbits.orbit_determination import (
     log_evidence,
     neglected,
 )
+from epipole.tasks.algorithms.orbits.platforms import platform_sizes
 from epipole.tasks.algorithms.orbits.reference_frames import state_rotation
 from epipole.tasks.common.grouping import factorize, group_offsets
 from epipole.tasks.common.orbit_forces import (
@@ -121,14 +122,20 @@ class ObservedObjects(NamedTuple):
         return (int(self.time_ns[rows.start]) + int(self.time_ns[rows.stop - 1])) // 2
 
     def directions(self, k: int) -> ObjectDirections:
-        """Return the directions of object k."""
+        """Return the directions of object k.
+
+        Sensors on one satellite share the error of its position: see `platform_sizes`.
+        """
         rows = self.rows(k)
         time_s, all_sensors, r_km, u, basis, weight, _ = self.views
         present, sensor = np.unique(all_sensors[rows], return_inverse=True)
         count = np.bincount(sensor)
+        repeated = np.ones(len(present)), platform_sizes(time_s[rows], sensor, r_km[rows])
         prior = np.zeros((len(present), 6, 6))
-        for variance, axes in zip(self.cov_shared[rows].T, (range(3), range(3, 6)), strict=True):
-            mean = np.bincount(sensor, variance) / count
+        for variance, times, axes in zip(
+            self.cov_shared[rows].T, repeated, (range(3), range(3, 6)), strict=True
+        ):
+            mean = times * np.bincount(sensor, variance) / count
             for axis in axes:
                 prior[:, axis, axis] = 1.0 / mean
         return ObjectDirections(

@@ -387,7 +387,7 @@ def _distinct_sets(rows: Flags, order: Indices) -> tuple[list[int], Indices]:
     merged into.
 
     Sets are compared with those that share a sensor with them: thousands of sensors, few of which
-    look at one place, have nearly as many sets as groups.
+    look at one volume, have nearly as many sets as groups.
     """
     size, size_of_kept = rows.sum(axis=1), np.zeros(len(rows), np.int64)
     kept: list[int] = []

@@ -22,6 +22,7 @@ from epipole.tasks.algorithms.orbits.trajectories import propagate_unknowns
 from epipole.tasks.common.orbit_forces import surroundings_of
 from epipole.tasks.publish import manoeuvres, orbits
 from epipole.tasks.publish.fitted_observations import complete_observations
+from epipole.tasks.publish.object_orbits import best_orbit, observed_objects
 from epipole.tasks.publish.orbits import fit_orbits, write_orbits
 from epipole.tasks.publish.share_out import share_out
 
@@ -322,6 +323,28 @@ def test_sensors_have_their_errors_as_all_orbits_show_them(tmp_path):
     made(tmp_path, shares=3)
     other = read_columns(tmp_path, "sensor_errors", SENSOR_ERRORS.names)
     np.testing.assert_allclose(stack(other, "direction_error_{}_arcsec"), bias, rtol=1e-6)
+
+
+def test_the_position_of_a_satellite_counts_once_for_all_its_sensors():
+    """Three sensors of each of two satellites see an object one after the other."""
+    blocks, n = np.array([0.0, 40.0, 80.0]), 40
+    times_s = np.concatenate([block + np.arange(0.0, 20.0, 2.0) for block in blocks])
+    around, square = surroundings_of(NIGHT), []
+    for seed in range(n):
+        seen = observed("a", LOW, seed=seed, times_s=times_s, n_sensors=2, shared=(
+            np.zeros((2, 3)), np.random.default_rng([seed, 1]).normal(size=(2, 3)) * 0.1
+        )).with_columns(position_sigma_km=0.1, bias_sigma_arcsec=0.0)  # fmt: skip
+        block = (pl.col("time").cast(pl.Int64) - NOON_NS) // 40_000_000_000
+        seen = seen.with_columns(sensor_id=pl.format("{}-{}", "sensor_id", block))
+        rows = seen.sort("object_id", "time", "sensor_id")
+        directions = observed_objects(rows, NOON_NS, around).directions(0)
+        assert len(directions.prior) == 6
+        fitted = best_orbit(directions, None, NOON_NS, around)
+        truth, _ = propagate_unknowns(LOW, 0.0, fitted.epoch_s, AROUND)
+        off = (fitted.orbit.unknowns - truth)[:6]
+        square.append(off @ np.linalg.solve(fitted.orbit.cov[:6, :6], off))
+    # The mean of n chi-squares of 6 degrees over 6 has a sigma of sqrt(1 / 3 n).
+    assert abs(np.mean(square) / 6 - 1) < 3.5 * np.sqrt(1 / (3 * n))
 
 
 def test_too_few_observations_are_a_reject(tmp_path):

@@ -1,0 +1,63 @@
+"""Platforms: sensors of one satellite are found by their paths, others are not."""
+
+import numpy as np
+import pytest
+from scenes.night_orbits import LOW, positions
+
+from epipole.tasks.algorithms.orbits.platforms import platform_sizes
+
+TURN_S = np.arange(0.0, 20.0)
+BEHIND_KM = 30.0  # a neighbour of the same plane
+
+
+def rows(paths, starts_s, error_km=0.0, seed=0):
+    """Return times, sensors and positions: sensor k is on `paths[k]` for 20 s from its start on."""
+    rng = np.random.default_rng(seed)
+    time_s = np.concatenate([start + TURN_S for start in starts_s])
+    sensor = np.repeat(np.arange(len(paths)), len(TURN_S))
+    r_km = np.concatenate([positions(p, s + TURN_S) for p, s in zip(paths, starts_s, strict=True)])
+    r_km = r_km + rng.normal(size=r_km.shape) * error_km
+    order = np.argsort(time_s, kind="stable")
+    return time_s[order], sensor[order], r_km[order]
+
+
+def behind(km):
+    """Return the orbit of a satellite on the same path, this far behind."""
+    speed = np.linalg.norm(LOW[3:6])
+    later = LOW.copy()
+    later[:3] -= LOW[3:6] * km / speed
+    return later
+
+
+OTHER = np.concatenate([-LOW[:3], LOW[3:]])
+
+
+@pytest.mark.parametrize("starts_s", [(0, 0, 0, 0), (0, 40, 80, 20), (0, 400, 800, -500)])
+@pytest.mark.parametrize("error_km", [0.0, 0.02])
+def test_sensors_of_one_satellite_are_found_whenever_they_see(starts_s, error_km):
+    for seed in range(4):
+        given = rows([LOW, LOW, LOW, OTHER], starts_s, error_km, seed)
+        np.testing.assert_array_equal(platform_sizes(*given), [3, 3, 3, 1])
+
+
+def test_a_neighbour_in_the_same_plane_is_another_satellite():
+    given = rows([LOW, behind(BEHIND_KM)], (0, 100))
+    np.testing.assert_array_equal(platform_sizes(*given), [1, 1])
+
+
+def test_positions_that_are_an_hour_apart_are_not_compared():
+    np.testing.assert_array_equal(platform_sizes(*rows([LOW, LOW], (0, 3600))), [1, 1])
+
+
+def test_single_positions_one_sensor_and_none():
+    time_s, sensor, r_km = rows([LOW, LOW], (0, 40))
+    one_each = [0, len(TURN_S)]
+    np.testing.assert_array_equal(
+        platform_sizes(time_s[one_each], sensor[one_each], r_km[one_each]), [1, 1]
+    )
+    first = np.flatnonzero((sensor == 0) | (time_s == 40.0))
+    np.testing.assert_array_equal(platform_sizes(time_s[first], sensor[first], r_km[first]), [2, 2])
+    at_once = np.zeros(2), np.array([0, 1]), r_km[:2]
+    np.testing.assert_array_equal(platform_sizes(*at_once), [1, 1])
+    np.testing.assert_array_equal(platform_sizes(*rows([LOW], (0,))), [1])
+    assert platform_sizes(np.zeros(0), np.zeros(0, np.int64), np.zeros((0, 3))).shape == (0,)
