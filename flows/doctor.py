@@ -74,7 +74,7 @@ def doctor(logs: Sequence[str], settings: Settings = Settings()) -> Diagnosis:  
             for k, path in enumerate(given.paths)
         ]
         frames = order_logs(folder, read, settings.sensors)
-        if not frames.sensors and not frames.rejects.num_rows:
+        if not frames.sensors and not left_out(concat(REJECTS, [given.rejects, frames.rejects])):
             raise LogError(
                 f"{', '.join(given.paths)}: neither frames nor states in these logs; "
                 "check the recording"

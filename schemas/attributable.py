@@ -48,7 +48,8 @@ ATTRIBUTABLE_FIELDS = [
             frame="GCRF",
             null=True,
             doc="Covariance of ra (times cos dec), dec and their rates (vra, vdec), of errors that "
-            "are independent in each frame.",
+            "are independent in each frame: on the axes east and north of this direction. Compare "
+            "directions and rates as vectors on them: at a pole, ra itself is unknown.",
         )
         for a, b in upper_triangle(ATTRIBUTABLE_AXES)
     ],

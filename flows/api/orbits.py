@@ -52,7 +52,9 @@ class Attributable(NamedTuple):
         Its rates; the first times cos dec.
     cov_arcsec2 : (4, 4) float
         Covariance of right ascension (times cos dec), declination and their rates [arcsec,
-        arcsec/s].
+        arcsec/s], on the axes east and north of this direction. Compare other directions and
+        rates as vectors on these axes: near a pole, right ascension itself has an error of its
+        sigma over cos dec, at most half a turn, and the axes turn with it.
     """
 
     epoch: np.datetime64

@@ -22,7 +22,7 @@ from epipole.io.work.parts import IDENTIFIED, Parts, write_part
 from epipole.io.work.work_layout import ReadFolder, SolvedParts, WorkFolder
 from epipole.schemas.bridge import array, concat
 from epipole.schemas.rejects import ObjectVerdict, Reason
-from epipole.schemas.settings import Settings
+from epipole.schemas.settings import EVERY_SENSOR, Settings
 from epipole.schemas.spans import DAY_NS, SPAN_NS, Span, day_of
 from epipole.schemas.stages import Stage
 from epipole.schemas.tables import POSITIONS, REJECTS, STATES
@@ -83,6 +83,10 @@ def read(logs: Sequence[str], folder: ReadFolder, settings: Settings) -> Ordered
     futures = [order_sensors.submit(folder, batch, settings.sensors) for batch in plan.batches()]
     frames = ordered_logs(plan, flat(results(Stage.READ, futures, (1, 2))), settings.sensors)
     LOGGER.info("read %s of %s", many(frames.n_frames, "frame"), many(len(frames.sources), "log"))
+    known = {EVERY_SENSOR, *frames.sensors, *frames.cameras["sensor_id"].to_pylist()}
+    if unknown := sorted({each.sensor for each in settings.sensors.assume} - known):
+        LOGGER.warning("`sensors.assume` names %s, of which these logs have nothing: check the id",
+                       ", ".join(unknown))  # fmt: skip
     return frames
 
 

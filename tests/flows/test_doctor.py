@@ -4,6 +4,7 @@ import json
 
 import polars as pl
 import pytest
+from mcap.writer import Writer
 from scenes.log_mistakes import MISTAKES, centroid_sigma, rewritten, starts_of_exposures
 
 from epipole.flows import api
@@ -15,6 +16,7 @@ from epipole.io.datasets.dataset import night_reader, read_table
 from epipole.io.logs.reader import read_log
 from epipole.schemas.errors import LogError, LogWarning
 from epipole.schemas.log_checks import CheckVerdict
+from epipole.schemas.settings import Settings
 from epipole.tasks.report.night_facts import needs_look, read_night_facts
 
 NIGHT = "2019-04-01"
@@ -65,6 +67,24 @@ def test_a_file_that_is_no_log_is_refused(tmp_path):
     (tmp_path / "a.mcap").write_bytes(b"x")
     with pytest.raises(LogError):
         doctor([str(tmp_path / "a.mcap")])
+
+
+def test_logs_without_anything_are_refused(tmp_path):
+    with (tmp_path / "a.mcap").open("wb") as file:
+        writer = Writer(file)
+        writer.start()
+        writer.finish()
+    with pytest.raises(LogError, match="neither frames nor states in these logs"):
+        doctor([str(tmp_path / "a.mcap")])
+
+
+def test_a_run_warns_of_assumptions_on_sensors_that_logs_do_not_have(
+    prefect, night_log, tmp_path, caplog
+):
+    assume = [{"sensor": "sat9", "time": "gps"}, {"sensor": "*", "time": "utc"}]
+    nightly([str(night_log)], str(tmp_path / "out"), Settings(sensors={"assume": assume}))
+    assert ("`sensors.assume` names sat9, of which these logs have nothing: check the id"
+            in caplog.messages)  # fmt: skip
 
 
 def test_a_run_writes_the_same_checks_and_shows_mistakes(prefect, wrong_log, tmp_path, caplog):

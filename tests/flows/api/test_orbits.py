@@ -157,3 +157,24 @@ def test_a_table_that_is_not_of_tracklets_is_an_error():
 
 def test_no_tracklets_have_no_objects():
     assert api.link(pl.DataFrame(rows_of(orbit_tracklets(11, 6, 4, 60.0))).clear()).to_list() == []
+
+
+@pytest.mark.parametrize("dec_deg", [0.0, 89.999, 90.0])
+def test_the_covariance_of_an_attributable_holds_on_its_axes_at_a_pole_too(dec_deg):
+    rng, t_s, dec = np.random.default_rng(0), np.arange(20) * 0.5 - 4.75, np.radians(dec_deg)
+    time = np.datetime64("2019-04-01T04:00", "ns") + np.rint(t_s * 1e9).astype("m8[ns]")
+    there = np.array([np.cos(dec), 0.0, np.sin(dec)])
+    axes = np.array([[0.0, 1.0, 0.0], [-np.sin(dec), 0.0, np.cos(dec)]])
+    squares = []
+    for _ in range(60):
+        u = there + (50 * t_s[:, None] * axes[0] + rng.normal(0, 2.0, (20, 2)) @ axes) / 206265
+        ra, up = np.arctan2(u[:, 1], u[:, 0]), np.arctan2(u[:, 2], np.hypot(u[:, 0], u[:, 1]))
+        found = api.attributable(time, np.degrees(ra), np.degrees(up), 2.0)
+        a, d = np.radians([found.ra_deg, found.dec_deg])
+        east = np.array([-np.sin(a), np.cos(a), 0.0])
+        north = np.array([-np.sin(d) * np.cos(a), -np.sin(d) * np.sin(a), np.cos(d)])
+        off = there - np.cross(east, north)
+        rate = 50 * axes[0] - found.ra_rate_arcsec_s * east - found.dec_rate_arcsec_s * north
+        z = [206265 * off @ east, 206265 * off @ north, rate @ east, rate @ north]
+        squares.append(z @ np.linalg.solve(found.cov_arcsec2, z))
+    assert np.mean(squares) == pytest.approx(4.0, rel=0.25)
