@@ -101,7 +101,9 @@ def _with_residuals(seen: pl.DataFrame, elements: ElementSet) -> pl.DataFrame:
 
 def _of_sensor(sensor_id: str, means: Array) -> SensorResidual:
     along, across = means.mean(axis=0)
-    along_scatter, across_scatter = means.std(axis=0) if len(means) > 1 else (np.nan, np.nan)
+    along_scatter, across_scatter = (
+        means.std(axis=0, ddof=1) if len(means) > 1 else (np.nan, np.nan)
+    )
     return SensorResidual(
         sensor_id, len(means), float(along), float(along_scatter), float(across),
         float(across_scatter),
