@@ -18,6 +18,7 @@ STEP_S = 60.0  # longest step of the propagation: right to a metre in these minu
 # second is for the gap between: velocities from positions that err by 50 m are off by metres a
 # second. Neighbours of a constellation are tens of kilometres apart.
 APART_KM, APART_KM_S = 1.0, 5e-3
+MAX_SPEED_KM_S = 12.0  # above the escape speed: what is farther need not be propagated
 
 
 def platform_sizes(time_s: Array, sensor: Indices, r_km: Array) -> Indices:
@@ -38,9 +39,16 @@ def platform_sizes(time_s: Array, sensor: Indices, r_km: Array) -> Indices:
     sensor leads to it.
     """
     n_sensors = int(sensor.max(initial=-1)) + 1
+    by_sensor = np.argsort(sensor, kind="stable")
+    bounds = np.searchsorted(sensor[by_sensor], np.arange(n_sensors + 1))
+    # Where two sensors see the object at the same time, one of them begins or ends within the time
+    # of the other; else an end of one is nearest to the other.
+    ends = by_sensor[np.stack([bounds[:-1], bounds[1:] - 1])]
     pairs = [np.zeros((2, 0), np.int64)]
     for s in range(n_sensors):
-        others = _on_its_path(time_s, sensor, r_km, s)
+        mine = by_sensor[bounds[s] : bounds[s + 1]]
+        others = _on_its_path(time_s, r_km, mine, np.delete(ends, s, axis=1))
+        others += others >= s  # the sensor itself was left out
         pairs.append(np.stack([np.full(len(others), s), others]))
     one, other = np.concatenate(pairs, axis=1)
     links = coo_array((np.ones(len(one)), (one, other)), (n_sensors, n_sensors))
@@ -48,27 +56,38 @@ def platform_sizes(time_s: Array, sensor: Indices, r_km: Array) -> Indices:
     return np.asarray(np.bincount(satellite)[satellite], np.int64)
 
 
-def _on_its_path(time_s: Array, sensor: Indices, r_km: Array, s: int) -> Indices:
-    """Return the other sensors that the path of sensor s leads to."""
-    mine, others = np.flatnonzero(sensor == s), np.flatnonzero(sensor != s)
-    if len(mine) < 2 or not len(others):
+def _on_its_path(time_s: Array, r_km: Array, mine: Indices, ends: Indices) -> Indices:
+    """Return the sensors that the path of another one leads to.
+
+    Parameters
+    ----------
+    mine : (k,) int
+        Rows of that one, in order of time.
+    ends : (2, m) int
+        First and last row of each of the sensors.
+    """
+    if len(mine) < 2 or not ends.size:
         return np.zeros(0, np.int64)
+    others = ends.ravel()
     after = np.clip(np.searchsorted(time_s[mine], time_s[others]), 1, len(mine) - 1)
     late = time_s[mine[after]] - time_s[others] < time_s[others] - time_s[mine[after - 1]]
     near = mine[np.where(late, after, after - 1)]
     gap_s = time_s[others] - time_s[near]
-    # Of each other sensor the position that is nearest in time.
-    order = np.lexsort((np.abs(gap_s), sensor[others]))
-    order = order[np.diff(sensor[others][order], prepend=-1) > 0]
-    order = order[np.abs(gap_s[order]) <= MAX_GAP_S]
-    if not len(order):
+    # Of each sensor the end that is nearer in time, if the satellite can have come from there.
+    nearer = np.argmin(np.abs(gap_s).reshape(ends.shape), axis=0)
+    which = nearer * ends.shape[1] + np.arange(ends.shape[1])
+    far_km = np.linalg.norm(r_km[near[which]] - r_km[others[which]], axis=1)
+    gap = np.abs(gap_s[which])
+    may_be = (gap <= MAX_GAP_S) & (far_km < APART_KM + MAX_SPEED_KM_S * gap)
+    if not may_be.any():
         return np.zeros(0, np.int64)
-    others, near, gap_s = others[order], near[order], gap_s[order]
+    others, near, gap_s = (rows[which[may_be]] for rows in (others, near, gap_s))
     v_km_s = _velocities(time_s[mine], r_km[mine], np.searchsorted(mine, near))
     steps = int(np.ceil(np.abs(gap_s).max() / STEP_S)) + 1
     there, _ = propagate_states(r_km[near], v_km_s, gap_s, steps)
     apart_km = np.linalg.norm(there - r_km[others], axis=1)
-    return sensor[others[apart_km < APART_KM + APART_KM_S * np.abs(gap_s)]]
+    on_path = apart_km < APART_KM + APART_KM_S * np.abs(gap_s)
+    return np.asarray(np.flatnonzero(may_be)[on_path], np.int64)
 
 
 def _velocities(time_s: Array, r_km: Array, rows: Indices) -> Array:
