@@ -45,13 +45,11 @@ def work_folder(root: Path, night: str, recipe: Recipe, keep: bool = False) -> I
     made_with = recipe.made_with
     folder = root / f"{NAME}-{night}-{made_with}-{recipe.work_key(night)}"
     kept = root / f"{KEPT}-{night}-{made_with}"
-    for mine in (folder, kept):
-        refuse_link(mine)
+    mine = {folder, kept}
+    for path in mine:
+        refuse_link(path)
     folder.mkdir(parents=True, exist_ok=True)
-    for other in {*root.glob(f"{NAME}-{night}-*"), *root.glob(f"{KEPT}-{night}-*")} - {
-        folder,
-        kept,
-    }:
+    for other in {*root.glob(f"{NAME}-{night}-*"), *root.glob(f"{KEPT}-{night}-*")} - mine:
         if other.name.startswith(f"{NAME}-{night}-{made_with}-") and not other.is_symlink():
             move_parts(other, kept)
         shutil.rmtree(other, ignore_errors=True)
