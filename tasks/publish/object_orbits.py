@@ -124,16 +124,20 @@ class ObservedObjects(NamedTuple):
     def directions(self, k: int) -> ObjectDirections:
         """Return the directions of object k.
 
-        Sensors on one satellite share the error of its position: see `platform_sizes`.
+        Sensors on one satellite may share the error of its position: see `platform_sizes`.
         """
         rows = self.rows(k)
         time_s, all_sensors, r_km, u, basis, weight, _ = self.views
         present, sensor = np.unique(all_sensors[rows], return_inverse=True)
         count = np.bincount(sensor)
-        repeated = np.ones(len(present)), platform_sizes(time_s[rows], sensor, r_km[rows])
+        sigma_km = np.sqrt(np.bincount(sensor, self.cov_shared[rows][:, 1]) / count)
+        sizes = platform_sizes(time_s[rows], sensor, r_km[rows], sigma_km)
         prior = np.zeros((len(present), 6, 6))
         for variance, times, axes in zip(
-            self.cov_shared[rows].T, repeated, (range(3), range(3, 6)), strict=True
+            self.cov_shared[rows].T,
+            (np.ones(len(present)), sizes),
+            (range(3), range(3, 6)),
+            strict=True,
         ):
             mean = times * np.bincount(sensor, variance) / count
             for axis in axes:

@@ -1,7 +1,9 @@
-"""Platforms: sensors that are on one satellite, and so share the error of its position.
+"""Platforms: sensors on one satellite that have the same states, and so share their error.
 
-The fits take the errors of two sensors as independent. Of n sensors on one satellite the error of
-the position would then average out. With n times its variance in each of them, it counts once.
+The fits take the errors of two sensors as independent. Of n sensors that have the same states the
+error of the position would then average out. With n times its variance in each of them, it counts
+once. Sensors on one satellite may as well have states of their orbit that err independently: these
+differ by more than they would with a common error.
 """
 
 import numpy as np
@@ -11,18 +13,18 @@ from scipy.sparse.csgraph import connected_components
 from epipole.schemas.arrays import Array, Indices
 from epipole.tasks.algorithms.earth_gravity import gravity, propagate_states
 
-MAX_GAP_S = 900.0  # between positions of two sensors that are compared: the motion is known so long
+MAX_GAP_S = 900.0  # between positions of two sensors that are compared
 BASE_S = 60.0  # longest time between the positions of a sensor from which its velocity follows
 STEP_S = 60.0  # longest step of the propagation: right to a metre in these minutes
-# Two sensors are on one satellite if the path of one leads within this distance of the other. The
-# second is for the gap between: velocities from positions that err by 50 m are off by metres a
-# second. Neighbours of a constellation are tens of kilometres apart.
-APART_KM, APART_KM_S = 1.0, 5e-3
+# Largest squared distance of the path of one from the other, over the variance that independent
+# errors have: these stay below it in one of 30 pairs (chi-square of three degrees of freedom), and
+# in fewer where velocities from positions carry them farther apart.
+SAME_STATES = 0.26
 MAX_SPEED_KM_S = 12.0  # above the escape speed: what is farther need not be propagated
 
 
-def platform_sizes(time_s: Array, sensor: Indices, r_km: Array) -> Indices:
-    """Return how many of s sensors are on the satellite of each, itself included: (s,).
+def platform_sizes(time_s: Array, sensor: Indices, r_km: Array, sigma_km: Array) -> Indices:
+    """Return how many of s sensors have the states of each, itself included: (s,).
 
     Parameters
     ----------
@@ -32,11 +34,13 @@ def platform_sizes(time_s: Array, sensor: Indices, r_km: Array) -> Indices:
         Sensor of each position, 0 .. s - 1 without gaps.
     r_km : (n, 3) float
         Positions of the sensors [km], in axes that do not turn; z along the Earth's pole.
+    sigma_km : (s,) float
+        1-sigma error of each sensor's positions, per axis.
 
     Notes
     -----
-    A sensor with a single position counts as alone on its satellite, unless the path of another
-    sensor leads to it.
+    A sensor with a single position counts as alone, unless the path of another sensor leads to it;
+    so do sensors whose positions are more than `MAX_GAP_S` apart.
     """
     n_sensors = int(sensor.max(initial=-1)) + 1
     by_sensor = np.argsort(sensor, kind="stable")
@@ -47,7 +51,8 @@ def platform_sizes(time_s: Array, sensor: Indices, r_km: Array) -> Indices:
     pairs = [np.zeros((2, 0), np.int64)]
     for s in range(n_sensors):
         mine = by_sensor[bounds[s] : bounds[s + 1]]
-        others = _on_its_path(time_s, r_km, mine, np.delete(ends, s, axis=1))
+        near_km = np.sqrt(SAME_STATES * (sigma_km[s] ** 2 + np.delete(sigma_km, s) ** 2))
+        others = _on_its_path(time_s, r_km, mine, np.delete(ends, s, axis=1), near_km)
         others += others >= s  # the sensor itself was left out
         pairs.append(np.stack([np.full(len(others), s), others]))
     one, other = np.concatenate(pairs, axis=1)
@@ -56,7 +61,9 @@ def platform_sizes(time_s: Array, sensor: Indices, r_km: Array) -> Indices:
     return np.asarray(np.bincount(satellite)[satellite], np.int64)
 
 
-def _on_its_path(time_s: Array, r_km: Array, mine: Indices, ends: Indices) -> Indices:
+def _on_its_path(
+    time_s: Array, r_km: Array, mine: Indices, ends: Indices, near_km: Array
+) -> Indices:
     """Return the sensors that the path of another one leads to.
 
     Parameters
@@ -65,6 +72,8 @@ def _on_its_path(time_s: Array, r_km: Array, mine: Indices, ends: Indices) -> In
         Rows of that one, in order of time.
     ends : (2, m) int
         First and last row of each of the sensors.
+    near_km : (m,) float
+        How near the path leads to each of those that are returned [km].
     """
     if len(mine) < 2 or not ends.size:
         return np.zeros(0, np.int64)
@@ -78,7 +87,7 @@ def _on_its_path(time_s: Array, r_km: Array, mine: Indices, ends: Indices) -> In
     which = nearer * ends.shape[1] + np.arange(ends.shape[1])
     far_km = np.linalg.norm(r_km[near[which]] - r_km[others[which]], axis=1)
     gap = np.abs(gap_s[which])
-    may_be = (gap <= MAX_GAP_S) & (far_km < APART_KM + MAX_SPEED_KM_S * gap)
+    may_be = (gap <= MAX_GAP_S) & (far_km < near_km + MAX_SPEED_KM_S * gap)
     if not may_be.any():
         return np.zeros(0, np.int64)
     others, near, gap_s = (rows[which[may_be]] for rows in (others, near, gap_s))
@@ -86,8 +95,7 @@ def _on_its_path(time_s: Array, r_km: Array, mine: Indices, ends: Indices) -> In
     steps = int(np.ceil(np.abs(gap_s).max() / STEP_S)) + 1
     there, _ = propagate_states(r_km[near], v_km_s, gap_s, steps)
     apart_km = np.linalg.norm(there - r_km[others], axis=1)
-    on_path = apart_km < APART_KM + APART_KM_S * np.abs(gap_s)
-    return np.asarray(np.flatnonzero(may_be)[on_path], np.int64)
+    return np.asarray(np.flatnonzero(may_be)[apart_km <= near_km[may_be]], np.int64)
 
 
 def _velocities(time_s: Array, r_km: Array, rows: Indices) -> Array:

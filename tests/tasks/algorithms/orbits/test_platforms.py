@@ -1,4 +1,4 @@
-"""Platforms: sensors of one satellite are found by their paths, others are not."""
+"""Platforms: sensors that have the states of one satellite are found, others are not."""
 
 import numpy as np
 import pytest
@@ -32,32 +32,50 @@ def behind(km):
 OTHER = np.concatenate([-LOW[:3], LOW[3:]])
 
 
-@pytest.mark.parametrize("starts_s", [(0, 0, 0, 0), (0, 40, 80, 20), (0, 400, 800, -500)])
-@pytest.mark.parametrize("error_km", [0.0, 0.02])
-def test_sensors_of_one_satellite_are_found_whenever_they_see(starts_s, error_km):
+SIGMA_KM = 0.1
+
+
+def sizes(time_s, sensor, r_km):
+    """Return the sizes for sensors that all have the same sigma."""
+    return platform_sizes(time_s, sensor, r_km, np.full(int(sensor.max(initial=-1)) + 1, SIGMA_KM))
+
+
+@pytest.mark.parametrize(
+    ("starts_s", "noise_km"),
+    [((0, 0, 0, 0), 0.015), ((0, 0, 0, 0), 0.0), ((0, 40, 80, 20), 0.0), ((0, 400, 800, -500), 0)],
+)
+def test_sensors_with_the_same_states_are_found_whenever_they_see(starts_s, noise_km):
     for seed in range(4):
-        given = rows([LOW, LOW, LOW, OTHER], starts_s, error_km, seed)
-        np.testing.assert_array_equal(platform_sizes(*given), [3, 3, 3, 1])
+        given = rows([LOW, LOW, LOW, OTHER], starts_s, noise_km, seed)
+        np.testing.assert_array_equal(sizes(*given), [3, 3, 3, 1])
+
+
+@pytest.mark.parametrize("starts_s", [(0, 0), (0, 40), (0, 400)])
+def test_sensors_of_one_satellite_whose_errors_differ_are_alone(starts_s):
+    n, together = 60, 0
+    for seed in range(n):
+        time_s, sensor, r_km = rows([LOW, LOW], starts_s)
+        error_km = np.random.default_rng(seed).normal(size=(2, 3)) * SIGMA_KM
+        together += sizes(time_s, sensor, r_km + error_km[sensor])[0] > 1
+    assert together < 8  # 2 on average
 
 
 def test_a_neighbour_in_the_same_plane_is_another_satellite():
     given = rows([LOW, behind(BEHIND_KM)], (0, 100))
-    np.testing.assert_array_equal(platform_sizes(*given), [1, 1])
+    np.testing.assert_array_equal(sizes(*given), [1, 1])
 
 
 def test_positions_that_are_an_hour_apart_are_not_compared():
-    np.testing.assert_array_equal(platform_sizes(*rows([LOW, LOW], (0, 3600))), [1, 1])
+    np.testing.assert_array_equal(sizes(*rows([LOW, LOW], (0, 3600))), [1, 1])
 
 
 def test_single_positions_one_sensor_and_none():
     time_s, sensor, r_km = rows([LOW, LOW], (0, 40))
     one_each = [0, len(TURN_S)]
-    np.testing.assert_array_equal(
-        platform_sizes(time_s[one_each], sensor[one_each], r_km[one_each]), [1, 1]
-    )
+    np.testing.assert_array_equal(sizes(time_s[one_each], sensor[one_each], r_km[one_each]), [1, 1])
     first = np.flatnonzero((sensor == 0) | (time_s == 40.0))
-    np.testing.assert_array_equal(platform_sizes(time_s[first], sensor[first], r_km[first]), [2, 2])
+    np.testing.assert_array_equal(sizes(time_s[first], sensor[first], r_km[first]), [2, 2])
     at_once = np.zeros(2), np.array([0, 1]), r_km[:2]
-    np.testing.assert_array_equal(platform_sizes(*at_once), [1, 1])
-    np.testing.assert_array_equal(platform_sizes(*rows([LOW], (0,))), [1])
-    assert platform_sizes(np.zeros(0), np.zeros(0, np.int64), np.zeros((0, 3))).shape == (0,)
+    np.testing.assert_array_equal(sizes(*at_once), [1, 1])
+    np.testing.assert_array_equal(sizes(*rows([LOW], (0,))), [1])
+    assert sizes(np.zeros(0), np.zeros(0, np.int64), np.zeros((0, 3))).shape == (0,)
