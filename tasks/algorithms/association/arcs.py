@@ -27,7 +27,9 @@ SLACK_SIGMA = 3.0
 def _begin(views, x, seen_by, state):
     """Write a first state at the first solved instant; return its index.
 
-    It is the straight line through the points, corrected for gravity.
+    `state` (6,) [km, km/s], GCRF, is the straight line through the points `x` (k, 3) [km],
+    corrected for gravity. `seen_by` (k,) as in `InstantPoints`; at least two instants must be
+    solved.
     """
     first, n, mean_t = -1, 0, 0.0
     for m in range(len(views.time_s)):
@@ -60,9 +62,11 @@ def _begin(views, x, seen_by, state):
 def _normal_equations(views, members, first, state, at, k, N, rhs):
     """Write the normal equations of the orbit; return chi-square, NaN behind a sensor.
 
-    `at` receives the states at the instants, `k` (5, 6) is work space. The partials are those
-    of motion in the gravity gradient at the first position, to the third order in time: good to
-    1 % over ten minutes of a low orbit.
+    `N` (6, 6) and `rhs` (6,) are written, for the tracklets `members` (n,) and the orbit with the
+    `state` (6,) [km, km/s], GCRF, at instant `first`. `at` receives its states, a row (6,) for each
+    instant from there on; `k` (5, 6) is work space. The partials are those of motion in the gravity
+    gradient at the first position, to the third order in time: good to 1 % over ten minutes of a
+    low orbit.
     """
     N[:] = 0.0
     rhs[:] = 0.0
@@ -103,7 +107,7 @@ def _normal_equations(views, members, first, state, at, k, N, rhs):
 
 @kernel
 def _ends(views, i, first):
-    """Return the first and last instant, from `first` on, at which a tracklet is seen."""
+    """Return the first and last instant, from `first` on, at which tracklet i is seen; else -1."""
     first_seen, last_seen = -1, -1
     for m in range(first, len(views.time_s)):
         if views.seen[i, m]:
@@ -116,9 +120,10 @@ def _ends(views, i, first):
 def _scatter(views, chance, i, last, first_seen, last_seen, b):
     """Write the drift from tracklet i to `last`, relative to their sensor's others.
 
-    i and `last` are one tracklet, or the first and the last fragment of a track. Return the
-    variance of the drift: at least half the square of the drift, since a far outlier is rare by a
-    power law, not by a Gaussian's tail.
+    i and `last` are one tracklet, or the first and the last fragment of a track. `b` (3,) [rad/s],
+    ICRS, is the mean rate of their direction between the instants `first_seen` and `last_seen`,
+    minus the usual one. Return the variance of the drift [rad^2/s^2]: at least half the square of
+    the drift, since a far outlier is rare by a power law, not by a Gaussian's tail.
     """
     s, dt = views.sensor[i], views.time_s[last_seen] - views.time_s[first_seen]
     square, u = 0.0, np.empty(3)
@@ -134,9 +139,12 @@ def _scatter(views, chance, i, last, first_seen, last_seen, b):
 def _velocity_prior(views, chance, members, first, state, prior, prior_mean):
     """Write mean and inverse covariance of the velocity's prior; return its log norm.
 
-    Across the line of sight objects move like the tracklets of the sensor whose tracklets
-    differ most; the norm includes that sensor's density at the drift of the first state. Along the
-    line of sight they move as orbits allow.
+    `prior_mean` (3,) [km/s] and `prior` (3, 3) [s^2/km^2], GCRF, are written, for the tracklets
+    `members` (n,) and the first `state` (6,) [km, km/s], which is that of the instant `first`.
+
+    Across the line of sight objects move like the tracklets of the sensor whose tracklets differ
+    most; the norm includes that sensor's density at the drift of the first state. Along the line of
+    sight they move as orbits allow.
     """
     radius = np.sqrt(state[0] ** 2 + state[1] ** 2 + state[2] ** 2)
     along = RADIAL_SHARE * np.sqrt(GM_KM3_S2 / radius)
@@ -166,7 +174,10 @@ def _velocity_prior(views, chance, members, first, state, prior, prior_mean):
 
 @kernel
 def _range(views, i, m, x):
-    """Return the distance [km] of x from the sensor of tracklet i at instant m."""
+    """Return the distance [km] of x from the sensor of tracklet i at instant m.
+
+    `x` is a position (3,) [km] or a state (6,) [km, km/s], GCRF.
+    """
     total = 0.0
     for a in range(3):
         total += (x[a] - views.camera[views.sensor[i], m, a]) ** 2
@@ -177,10 +188,10 @@ def _range(views, i, m, x):
 def _unrelated_odds_of_sensor(views, chance, members, q, first, at):
     """Return the log-likelihood of a sensor's tracklets without the orbit: see `_unrelated_odds`.
 
-    All of one sensor count with its first member, q; others give 0. They may be fragments of one
-    unrelated object, or objects by themselves: the likelier of the two counts. Otherwise a track
-    that breaks would be evidence again and again. Also returns by how much it is likelier than
-    objects by themselves.
+    The sensor is that of ``members[q]``, of the tracklets `members` (n,). All of one sensor count
+    with its first member, q; others give 0. They may be fragments of one unrelated object, or
+    objects by themselves: the likelier of the two counts. Otherwise a track that breaks would be
+    evidence again and again. Also returns by how much it is likelier than objects by themselves.
     """
     s, n = views.sensor[members[q]], 0
     for k in range(len(members)):
@@ -207,8 +218,9 @@ def _unrelated_odds(views, chance, fragments, first, at):
     """Return the log-likelihood of a sensor's tracklets as those of one unrelated object.
 
     It lies anywhere in the field and drifts like the sensor's other tracklets. Its position and
-    drift are relative to the orbit with the states `at`, so the curvature of the path is common
-    to both hypotheses.
+    drift are relative to the orbit with the states `at` (k, 6) [km, km/s], GCRF, from the instant
+    `first` on, so the curvature of the path is common to both hypotheses. `fragments` (n,) are the
+    tracklets.
     """
     s, i, last = views.sensor[fragments[0]], fragments[0], fragments[0]
     J, h, part = np.zeros((4, 4)), np.zeros(4), np.empty(11)
@@ -261,7 +273,10 @@ def _unrelated_odds(views, chance, fragments, first, at):
 
 @kernel
 def _is_hyperbolic(state, L):
-    """Return whether the orbit is hyperbolic by 3 sigma; L is the factored information."""
+    """Return whether the orbit is hyperbolic by 3 sigma.
+
+    `state` (6,) [km, km/s], GCRF; `L` (6, 6) is its information, factored by `factor`.
+    """
     r = np.sqrt(state[0] ** 2 + state[1] ** 2 + state[2] ** 2)
     v2 = state[3] ** 2 + state[4] ** 2 + state[5] ** 2
     slope, variance = np.empty(6), 0.0
@@ -282,7 +297,8 @@ def arc_odds(views, chance, members, points):
 
     Without the prior of the position and without misses (see `odds.score`). -inf where no orbit
     fits, or only a hyperbolic one. Also returns the log-odds that tracklets of one sensor are
-    fragments of one object, which do not count for the orbit.
+    fragments of one object, which do not count for the orbit. `members` (n,) are the tracklets,
+    `points` their `InstantPoints`, of which two or more are solved.
     """
     state, k = np.empty(6), np.empty((5, 6))
     at = np.empty((len(views.time_s), 6))

@@ -31,7 +31,11 @@ NEAR_SIGMA = 6.0
 
 @borrowing_kernel
 def blocked(r, x, radius):
-    """Return whether the Earth, of this radius, is between r and x."""
+    """Return whether the Earth, of this radius [km], is between r and x.
+
+    `r` and `x` are positions (3,) [km], GCRF. `r` may be a row of `Views.camera`, which begins with
+    one.
+    """
     dot, length2, r2 = 0.0, 0.0, 0.0
     for a in range(3):
         d = x[a] - r[a]
@@ -45,7 +49,8 @@ def blocked(r, x, radius):
 def sees(r, R, half_field, x):
     """Return whether a sensor at r, with attitude R, has x in its field and in view.
 
-    False at the edge of the field, behind the Earth, and where r or R is unknown (NaN).
+    `r` and `x` (3,) [km], GCRF; `R` (3, 3), sensor from ICRS; `half_field` (2,), tangents of half
+    the field. False at the edge of the field, behind the Earth, and where r or R is unknown (NaN).
     """
     d0, d1, d2 = x[0] - r[0], x[1] - r[1], x[2] - r[2]
     depth = R[2, 0] * d0 + R[2, 1] * d1 + R[2, 2] * d2
@@ -60,14 +65,21 @@ def sees(r, R, half_field, x):
 
 @kernel
 def seeing(r, R, half_field, x, out):
-    """Write for each sensor whether it has x in its field and in view, as in `sees`."""
+    """Write for each sensor whether it has x in its field and in view, as in `sees`.
+
+    `r` (s, 3), `R` (s, 3, 3) and `half_field` (s, 2) are of s sensors, `x` (3,) is one point [km],
+    GCRF; `out` (s,) bool is written.
+    """
     for s in range(len(out)):
         out[s] = sees(r[s], R[s], half_field[s], x)
 
 
 @borrowing_kernel
 def in_view(cam, x):
-    """Return the same as `sees`, for a row of `Views.camera`."""
+    """Return the same as `sees`, for a row of `Views.camera`.
+
+    `cam` (33,) is the sensor at an instant, `x` (3,) a point [km], GCRF.
+    """
     d0, d1, d2 = x[0] - cam[0], x[1] - cam[1], x[2] - cam[2]
     depth = cam[TURN + 6] * d0 + cam[TURN + 7] * d1 + cam[TURN + 8] * d2
     if not depth > 0.0:
@@ -84,7 +96,10 @@ def in_view(cam, x):
 
 @borrowing_kernel
 def looks_at(views, s, X, seen_by):
-    """Return whether sensor s has the points in its field at all solved instants."""
+    """Return whether sensor s has the points in its field at all solved instants.
+
+    `X` (k, 3) [km], GCRF, and `seen_by` (k,) as in `InstantPoints`. False if no instant is solved.
+    """
     looked = False
     for m in range(len(views.time_s)):
         if seen_by[m] < 2:
@@ -99,8 +114,8 @@ def looks_at(views, s, X, seen_by):
 def should_detect(views, s, points, nearest_km2):
     """Return whether a sensor without a tracklet of the object counts as a miss.
 
-    It does if the points are in its field, and not much fainter than for the members' sensors:
-    `nearest_km2` is `nearest_range2` of these.
+    It does if the points, `InstantPoints`, are in its field, and not much fainter than for the
+    members' sensors: `nearest_km2` is `nearest_range2` of these.
     """
     if not looks_at(views, s, points.x_km, points.seen_by):
         return False
@@ -117,6 +132,7 @@ def should_detect(views, s, points, nearest_km2):
 def nearest_range2(views, members, points):
     """Return the shortest squared range [km^2] from which members see the first solved point.
 
+    `members` (n,) are tracklets, `points` are `InstantPoints`; inf if no member sees that point.
     The limits of other sensors are not used: their cameras may be better.
     """
     nearest2 = np.inf
@@ -133,7 +149,10 @@ def nearest_range2(views, members, points):
 
 @borrowing_kernel
 def _range2(cam, s, m, x):
-    """Return the squared range [km^2] from sensor s at instant m to the point x."""
+    """Return the squared range [km^2] from sensor s at instant m to the point x.
+
+    `cam` (s, k, 33) is `Views.camera`, `x` (3,) [km], GCRF.
+    """
     d0, d1, d2 = x[0] - cam[s, m, 0], x[1] - cam[s, m, 1], x[2] - cam[s, m, 2]
     return d0 * d0 + d1 * d1 + d2 * d2
 
@@ -142,8 +161,9 @@ def _range2(cam, s, m, x):
 def near_fields(views, points, sensors, near):
     """Write which of the sensors may have a point in their field at any solved instant.
 
-    `near` is the list of these; returns their number. A fast first test: within 6 sigma of the
-    cone that holds the sensor's tracklets and field.
+    `sensors` (n,) are tested and `points` are `InstantPoints`. Those found are the first ones of
+    `near` (n,) or longer; returns their number. A fast first test: within 6 sigma of the cone that
+    holds the sensor's tracklets and field.
     """
     n, cam = 0, views.camera
     X, _, P, seen_by = points
@@ -216,7 +236,8 @@ def score(space, work, members, near):
 def _detections(space, work, members, near):
     """Return the log-probability of which sensors detect the object and which miss it.
 
-    Writes the list of those that miss it; also returns their number.
+    `members` (n,) are its tracklets, `near` (m,) the sensors whose field may hold its points.
+    Writes the list of those that miss it, `work.missed`; also returns their number.
     """
     views, detected = space.views, space.chance.detected
     total, n_missed = 0.0, 0
@@ -237,7 +258,7 @@ def _detections(space, work, members, near):
 
 @borrowing_kernel
 def next_mark(stamp):
-    """Return the number of a new list of sensors, see `WorkSpace.stamp`."""
+    """Return the number of a new list of sensors; `stamp` (s + 1,), see `WorkSpace`, counts it."""
     stamp[-1] += 1
     return stamp[-1]
 
@@ -246,8 +267,8 @@ def next_mark(stamp):
 def _altitude_weight(x, shells):
     """Return the log of the object density at this radius over the mean density.
 
-    `shells` are rows of (lowest, highest radius [km], weight). Weights of overlapping shells
-    add up. Without shells the density is uniform.
+    `x` (3,) is the position [km], GCRF. `shells` (j, 3) are rows of (lowest, highest radius [km],
+    weight). Weights of overlapping shells add up. Without shells the density is uniform.
     """
     if len(shells) == 0:
         return 0.0

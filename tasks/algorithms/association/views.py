@@ -177,7 +177,9 @@ def _planes(first, order, seen, u):
 def _sort_by_position(first, order, seen, u, plane):
     """Sort the tracklets of each sensor by cells of its plane at the first instant they are seen.
 
-    A hypothesis reads the few tracklets near its points: these become neighbours in memory.
+    A hypothesis reads the few tracklets near its points: these become neighbours in memory. Changes
+    `order` (t,), the rows of the samples by sensor, from ``first[s]`` to ``first[s + 1]``.
+    `seen` (t, k) and `u` (t, k, 3) are those of `Samples`, `plane` (s, k, 3, 3) is of `_planes`.
     """
     n_instants = seen.shape[1]
     cell, position, sorted_ = (
@@ -231,7 +233,9 @@ def _reach(camera: Array, grid: Indices) -> Array:
 def _flatten(sensor, order, seen, u, cov, rate, camera, sight):
     """Project directions, rates, and covariances on `directions.tangent_basis` onto the planes.
 
-    `sensor` and `sight` are in the order of the search, the samples are not.
+    Writes `sight` (t, k, 9), but for SIGMA_KM, and MAX_RATE of `camera` (s, k, 33). These and
+    `sensor` (t,) are in the order of the search. `seen`, `u`, `cov` and `rate` are those of
+    `Samples`, and `order` (t,) are their rows; `rate` is (0, k, 3) where rates are missing.
     """
     M, t, p = np.empty((2, 2)), np.empty((2, 3)), np.empty((3, 3))
     for n in range(len(order)):
@@ -279,7 +283,12 @@ def _flatten(sensor, order, seen, u, cov, rate, camera, sight):
 
 @kernel
 def _fill_grids(first, seen, sight, camera, grid, cell_start, cell_item):
-    """Sort each sensor's tracklets into square cells, about one tracklet per cell."""
+    """Sort each sensor's tracklets into square cells, about one tracklet per cell.
+
+    Writes `grid`, `cell_start` and `cell_item` of `Views`, all zero before, and CORNER, SCALE and
+    MAX_VARIANCE of `camera` (s, k, 33). `first` (s + 1,), `seen` (t, k) and `sight` (t, k, 9) are
+    those of `Views`.
+    """
     begin, filled = 0, 0
     cell = np.empty(seen.shape[0], np.int64)
     for s in range(grid.shape[0]):
@@ -340,7 +349,7 @@ def direction(views, i, m, u):
 def extra_light_s(d0, d1, d2, x):
     """Return the light time from x to the sensor minus that to the Earth's centre [s].
 
-    `d0`, `d1`, `d2` is the vector from the sensor to the point x [km].
+    `d0`, `d1`, `d2` is the vector [km] from the sensor to the point `x` (3,) [km], GCRF.
     """
     range_km = np.sqrt(d0 * d0 + d1 * d1 + d2 * d2)
     return (range_km - np.sqrt(x[0] * x[0] + x[1] * x[1] + x[2] * x[2])) / SPEED_OF_LIGHT_KM_S
@@ -350,8 +359,9 @@ def extra_light_s(d0, d1, d2, x):
 def residual(views, i, m, x, part):
     """Write a view's residual, predicted minus measured, with partials and weight.
 
-    The object is at x one geocentric light time before the instant. A sensor at another range
-    sees it there `extra_light_s` after the instant. Sensor and direction are moved to that time.
+    The object is at x (3,) [km], GCRF, one geocentric light time before the instant. A sensor at
+    another range sees it there `extra_light_s` after the instant. Sensor and direction are moved to
+    that time.
 
     `part` (11,), on the sensor's plane: the residual (2), its partials (2 by 3) [1/km], and the
     inverse covariance (xx, xy, yy). Returns the depth of the point [km], 0 behind the sensor.
@@ -385,7 +395,7 @@ def residual(views, i, m, x, part):
 
 @borrowing_kernel
 def residual_chi2(part):
-    """Return the chi-square of a residual that `residual` wrote."""
+    """Return the chi-square of a residual that `residual` wrote to `part` (11,)."""
     e0, e1 = part[0], part[1]
     return part[8] * e0 * e0 + 2 * part[9] * e0 * e1 + part[10] * e1 * e1
 
@@ -395,7 +405,7 @@ def error_sr(views, i, m, part):
     """Return the solid angle [sr] of the errors of a residual that `residual` wrote.
 
     It is 2 pi times the square root of the determinant of their covariance, that of the sensor's
-    position included.
+    position included. The residual `part` (11,) is that of tracklet i at instant m.
     """
     flat = 1.0 + views.sight[i, m, X] ** 2 + views.sight[i, m, Y] ** 2
     return 2 * np.pi / np.sqrt((part[8] * part[10] - part[9] ** 2) * flat**3)

@@ -170,9 +170,11 @@ def solve_point(use, lines, velocity, x, P):
 
 @kernel
 def _worst(use, lines, velocity, x, P):
-    """Return the view with the largest normalised residual, and its square; as `solve_point`.
+    """Return the view with the largest normalised residual, and its square [sigma^2].
 
-    It is normalised by the covariance of the residual, C - J P J', which is smaller than C.
+    It is normalised by the covariance of the residual, C - J P J', which is smaller than C. The
+    views `use` (m,), the point `x` (3,) [km], its covariance `P` (3, 3) [km^2], and
+    `velocity` (3,) [km/s] as in `solve_point`. The view is -1 if no residual can be tested.
     """
     r, u, basis, cov, sigma_km = lines
     e, shift = np.empty(2), np.zeros(3)

@@ -125,7 +125,10 @@ def _predict(views, s, points, predicted):
 
 @borrowing_kernel
 def _gate(views, s, m, predicted, gate_sigma):
-    """Return the maximum distance of a tracklet from the prediction, along both coordinates."""
+    """Return the maximum distance of a tracklet from the prediction, along both coordinates.
+
+    They are those of the plane of sensor s at instant m; `predicted` (k, 10) is of `_predict`.
+    """
     cam = views.camera
     gate = np.sqrt(quantile(2, gate_sigma))
     position_error = views.sight[views.first[s], m, SIGMA_KM] / predicted[m, DEPTH]
@@ -138,7 +141,11 @@ def _gate(views, s, m, predicted, gate_sigma):
 
 @borrowing_kernel
 def _window(views, s, m, predicted, reach0, reach1):
-    """Return the grid cells within the gate: first and last row, first and last column."""
+    """Return the grid cells within the gate: first and last row, first and last column.
+
+    `predicted` (k, 10) is of `_predict`; `reach0` and `reach1`, on the plane, are of `_gate`. Where
+    the grid has no such cell, a last number is below the first.
+    """
     cam, side = views.camera, views.grid[s, m, 1]
     here = predicted[m, A0] - cam[s, m, CORNER]
     lo0 = max(int(np.floor((here - reach0) * cam[s, m, SCALE])), 0)
@@ -156,6 +163,7 @@ def _fit(views, chance, s, c, seen_by, predicted, gate_sigma):
     This is the log-likelihood of its directions as views of the points, minus the one as an
     unrelated tracklet. At the first instant that they share, an unrelated tracklet may be anywhere
     in the field. From there on, it is uncertain only by the spread of the sensor's rates.
+    `seen_by` (k,) is of the points, `predicted` (k, 10) is what `_predict` wrote for sensor s.
     """
     gain, total, n, first_s, see = 0.0, 0.0, 0, 0.0, views.sight
     largest = quantile(2 * len(views.time_s), gate_sigma)
@@ -192,7 +200,7 @@ def _fit(views, chance, s, c, seen_by, predicted, gate_sigma):
 
 @borrowing_kernel
 def _shared_before(views, c, m, seen_by):
-    """Return whether tracklet c shares an instant before m with the points."""
+    """Return whether tracklet c shares an instant before m with the points, by `seen_by` (k,)."""
     shared = False
     for earlier in range(m):
         shared |= seen_by[earlier] >= 2 and views.seen[c, earlier]
@@ -201,7 +209,10 @@ def _shared_before(views, c, m, seen_by):
 
 @borrowing_kernel
 def _overlaps(views, c, same_sensor):
-    """Return whether c overlaps in time with one of these tracklets of its sensor, or is one."""
+    """Return whether c overlaps in time with one of these tracklets of its sensor, or is one.
+
+    `same_sensor` (n,) are the tracklets.
+    """
     for o in same_sensor:
         if o == c or (views.start_s[c] <= views.end_s[o] and views.start_s[o] <= views.end_s[c]):
             return True
@@ -212,7 +223,8 @@ def _overlaps(views, c, same_sensor):
 def lasts_throughout(views, c, seen_by):
     """Return whether c lasts from the first solved instant to the last.
 
-    Then no other tracklet of its sensor can be the same object at these instants.
+    Then no other tracklet of its sensor can be the same object at these instants. `seen_by` (k,) as
+    in `InstantPoints`.
     """
     first, last = -1, -1
     for m in range(len(seen_by)):
@@ -228,7 +240,8 @@ def lasts_throughout(views, c, seen_by):
 def other_group_near(space, work, s, group, g):
     """Return whether sensor s has a tracklet of another group than g within the gate.
 
-    A fast first test: a tracklet within the gate may still not fit.
+    `group` (t,) are the groups of the tracklets, -1 for no group; these do not count. A fast first
+    test: a tracklet within the gate may still not fit. Writes `work.predicted`.
     """
     views, seen_by, predicted = space.views, work.points.seen_by, work.predicted
     _predict(views, s, work.points, predicted)
@@ -251,7 +264,10 @@ def other_group_near(space, work, s, group, g):
 
 @borrowing_kernel
 def odds_of_view(space, work, s, c):
-    """Return the log-odds that tracklet c of sensor s adds to the points, without a gate."""
+    """Return the log-odds that tracklet c of sensor s adds to the points, without a gate.
+
+    The points are those of `work`; writes `work.predicted`.
+    """
     _predict(space.views, s, work.points, work.predicted)
     seen_by = work.points.seen_by
     return _fit(space.views, space.chance, s, c, seen_by, work.predicted, np.inf)

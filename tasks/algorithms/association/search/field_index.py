@@ -135,7 +135,11 @@ class Entering(NamedTuple):
 
 @borrowing_kernel
 def ground_range(position, axis, half):
-    """Return the longest range [km] in a cone to the ground; inf if some of it passes the Earth."""
+    """Return the longest range [km] in a cone to the ground; inf if some of it passes the Earth.
+
+    `position` (3,) [km] and the unit vector `axis` (3,) are in the GCRF; `half` is the cone's
+    half-angle [rad].
+    """
     radius2, down = 0.0, 0.0
     for a in range(3):
         radius2 += position[a] * position[a]
@@ -187,7 +191,10 @@ def cones_of(views):
 def _enter(cones, farthest_km, size, capacity):
     """Enter all fields in cells of a size; return the cells of the sensors and the hash table.
 
-    The number of cells is -1 if there are more than `capacity` entries.
+    Of `cones` (s, k, 7), see `cones_of`, as far as `farthest_km` from the Earth's centre. Returns
+    `by_sensor_first` (s + 1,) and `by_sensor_cell` (v,), the number of cells, and `keys` and
+    `slots` (h,), as in `FieldIndex`. The number of cells is -1 if there are more than `capacity`
+    entries.
     """
     n_sensors, n_instants = cones.shape[0], cones.shape[1]
     table = 1
@@ -231,8 +238,8 @@ def _enter(cones, farthest_km, size, capacity):
 def _together(cones, s, m, size):
     """Return the last instant until which a field moves by less than a cell, and its motion.
 
-    The motion is the maximum shift of the position [km] and turn of the axis [rad], and the
-    maximum tangent of the cone's half-angle.
+    From instant m on, for sensor s of `cones` (s, k, 7). The motion is the maximum shift of the
+    position [km] and turn of the axis [rad], and the maximum tangent of the cone's half-angle.
     """
     last, shift, turn, reach = m, 0.0, 0.0, cones[s, m, TANGENT]
     for h in range(m + 1, cones.shape[1]):
@@ -253,7 +260,9 @@ def _together(cones, s, m, size):
 def _walk(cones, sweep, farthest_km, entering):
     """Enter one cone, step by step along its axis; return false if the arrays are full.
 
-    A ball encloses each step. The walk ends beyond the farthest distance, or at the Earth.
+    `cones` (s, k, 7); `sweep` is the sensor, the instant, and the motion as in `_together`: shift
+    [km], turn [rad], tangent. A ball encloses each step. The walk ends beyond the farthest
+    distance, or at the Earth.
     """
     s, m, shift, turn, reach = sweep
     half = np.arctan(reach) + turn
@@ -279,7 +288,10 @@ def _walk(cones, sweep, farthest_km, entering):
 
 @borrowing_kernel
 def _along(cones, s, m, at):
-    """Return the point [km, GCRF] of a cone's axis that is `at` [km] from its sensor."""
+    """Return the point [km, GCRF] of a cone's axis that is `at` [km] from its sensor.
+
+    The cone is that of sensor s at instant m, of `cones` (s, k, 7).
+    """
     return (
         cones[s, m, 0] + at * cones[s, m, AXIS],
         cones[s, m, 1] + at * cones[s, m, AXIS + 1],
@@ -289,7 +301,11 @@ def _along(cones, s, m, at):
 
 @borrowing_kernel
 def _enter_ball(cones, sweep, x, ball, entering):
-    """Enter a sensor in the cells that a ball and its cone touch; false if the arrays are full."""
+    """Enter a sensor in the cells that a ball and its cone touch; false if the arrays are full.
+
+    The ball has the centre `x` (3,) [km], GCRF, and the radius `ball` [km]. `cones` and `sweep` as
+    in `_walk`.
+    """
     size, low, high, count = entering.size, entering.low, entering.high, entering.filled
     keys, slots, latest = entering.keys, entering.slots, entering.latest
     distance = np.sqrt(x[0] * x[0] + x[1] * x[1] + x[2] * x[2])
@@ -331,7 +347,10 @@ def _enter_ball(cones, sweep, x, ball, entering):
 
 @borrowing_kernel
 def _touches(cones, sweep, size, i, j, k):
-    """Return whether the centre of a cell is within half its diagonal of a cone."""
+    """Return whether the centre of a cell is within half its diagonal of a cone.
+
+    The cell is (i, j, k) of those with this size; `cones` and `sweep` as in `_walk`.
+    """
     s, m, shift, turn, reach = sweep
     y0, y1, y2 = (i + 0.5) * size, (j + 0.5) * size, (k + 0.5) * size
     f = max(np.sqrt(y0 * y0 + y1 * y1 + y2 * y2), 1e-9)
@@ -382,8 +401,9 @@ def cells_across(index, x, radius_km):
 def sensors_about(index, x, radius_km, stamp, mark, out, n):
     """Append to `out` the sensors whose fields may touch a ball; return the new length of `out`.
 
-    `x` (3,) is the centre [km, GCRF]. Sensors with ``stamp[s] == mark`` are in `out` already. The
-    ball should not be much larger than a cell: all cells that it touches are visited.
+    `x` (3,) is the centre [km, GCRF]; `out` (s,) has n sensors so far. Sensors with
+    ``stamp[s] == mark`` are in `out` already; `stamp` (s + 1,) is changed. The ball should not be
+    much larger than a cell: all cells that it touches are visited.
     """
     if index.size == 0.0:
         return _add_cell(index, 0, stamp, mark, out, n)
@@ -401,7 +421,7 @@ def sensors_about(index, x, radius_km, stamp, mark, out, n):
 
 @borrowing_kernel
 def _add_cell(index, q, stamp, mark, out, n):
-    """Append the sensors of cell q to `out`, as in `sensors_about`; return the new length."""
+    """Append the sensors of cell q to `out` (s,), as in `sensors_about`; return the new length."""
     for k in range(index.first[q], index.first[q + 1]):
         s = index.sensor[k]
         if stamp[s] != mark:
@@ -413,7 +433,10 @@ def _add_cell(index, q, stamp, mark, out, n):
 
 @borrowing_kernel
 def sensors_sharing(index, a, b, stamp, mark, out):
-    """Write the sensors that share a cell with both a and b; return their number."""
+    """Write the sensors that share a cell with both a and b; return their number.
+
+    These are the first ones of `out` (s,); `stamp` (s + 1,) and `mark` as in `sensors_about`.
+    """
     i, j, n = index.by_sensor_first[a], index.by_sensor_first[b], 0
     while i < index.by_sensor_first[a + 1] and j < index.by_sensor_first[b + 1]:
         p, q = index.by_sensor_cell[i], index.by_sensor_cell[j]

@@ -202,7 +202,11 @@ def _grow(space, work, members, nearby):
 
 @borrowing_kernel
 def _begin(space, work, members, nearby):
-    """Solve the points of a seed; return the number of sensors near them, -1 if impossible."""
+    """Solve the points of a seed; return the number of sensors near them, -1 if impossible.
+
+    `members` (2,) are its tracklets, `nearby` (n,) the sensors that may be near. Writes
+    `work.points`, and the sensors to `work.near`.
+    """
     points = work.points
     points.seen_by[:] = 0
     chi2, dof = solve(space.views, members, points, work.part)
@@ -218,6 +222,7 @@ def _has_unsolved_instant(views, members, seen_by):
     """Return whether two members share an instant that is not solved.
 
     At first only those of the seed are solved. Other sensors may see the object at others.
+    `members` (n,) are tracklets, `seen_by` (k,) as in `InstantPoints`.
     """
     for m in range(len(seen_by)):
         count = 0
@@ -230,11 +235,11 @@ def _has_unsolved_instant(views, members, seen_by):
 
 @inlined_kernel
 def _join_sensor(space, work, s, members, n, evidence):
-    """Add the tracklets of sensor s that fit to the members.
+    """Add the tracklets of sensor s that fit to the members, the first n of `members` (t + 2,).
 
-    Returns the new size (-1 if a point can no longer be solved), the log-odds `evidence` with what
-    the tracklets add, and whether the sensor detects the object. It also does if two tracklets fit
-    about equally well, so that neither joins.
+    Updates `work.points`. Returns the new size (-1 if a point can no longer be solved), the
+    log-odds `evidence` with what the tracklets add, and whether the sensor detects the object. It
+    also does if two tracklets fit about equally well, so that neither joins.
     """
     views, detected, n_same = space.views, False, 0
     for i in members[:2]:
@@ -265,8 +270,9 @@ def _join_sensor(space, work, s, members, n, evidence):
 def _settle(space, work, members, n):
     """Solve the points and drop the members that fit worst, until all fit; return the size.
 
-    The seed's tracklets may be dropped too. Large hypotheses drop several at a time, so the cost
-    grows with their size only. The size is 0 if fewer than two are left.
+    Changes the first n of `members` (t + 2,), and `work.points`. The seed's tracklets may be
+    dropped too. Large hypotheses drop several at a time, so the cost grows with their size only.
+    The size is 0 if fewer than two are left.
     """
     views, part = space.views, work.part
     X, _, _, seen_by = work.points
@@ -302,9 +308,10 @@ def _settle(space, work, members, n):
 def _review(space, work, members, n, early):
     """Choose the first `early` members again, now that the points are well known; return the size.
 
-    They were chosen with points from few views. A false member does more harm than a miss. So a
-    tracklet joins only if it adds at least `MIN_GAIN`, and leads the sensor's next best one by
-    `MIN_LEAD` if that one adds as much. All other members stay if they still fit.
+    Changes `members` (t + 2,), of which the first n count. The early ones were chosen with points
+    from few views. A false member does more harm than a miss. So a tracklet joins only if it adds
+    at least `MIN_GAIN`, and leads the sensor's next best one by `MIN_LEAD` if that one adds as
+    much. All other members stay if they still fit.
     """
     views, stamp, early = space.views, work.stamp, min(early, n)
     mark = next_mark(stamp)
@@ -364,7 +371,9 @@ def _is_clear(space, work, members, n_missed, value, clear):
     """Return whether a hypothesis may be taken at once.
 
     It needs many views, and about the expected number of detections by the sensors that have it in
-    their field. A mixture of two objects' tracklets fits only some of these sensors.
+    their field. A mixture of two objects' tracklets fits only some of these sensors. `members` (n,)
+    are its tracklets, the first `n_missed` of `work.missed` the sensors that miss it; its log-odds
+    `value` must exceed `clear`.
     """
     if not (value > clear and len(members) >= WELL_KNOWN):
         return False
@@ -383,7 +392,7 @@ def _is_clear(space, work, members, n_missed, value, clear):
 
 @kernel
 def _doubled(values, n):
-    """Return an array twice as long with the same first n rows."""
+    """Return an array twice as long as `values` (m, ...), with the same first n rows."""
     out = np.empty((2 * len(values), *values.shape[1:]), values.dtype)
     out[:n] = values[:n]
     return out
@@ -391,7 +400,7 @@ def _doubled(values, n):
 
 @kernel
 def _with_capacity(values, n, more):
-    """Return the array, or a longer one with the same first n values, for `more` values."""
+    """Return `values` (m,), or a longer array with the same first n of them, for `more` values."""
     while n + more > len(values):
         values = _doubled(values, n)
     return values

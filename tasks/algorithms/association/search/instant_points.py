@@ -15,7 +15,11 @@ RHS = 11  # offset of the right-hand side of the normal equations, after the res
 
 @borrowing_kernel
 def _start(views, members, m, points, part):
-    """Write the point nearest to the members' lines; return false where they are parallel."""
+    """Write the point nearest to the members' lines; return false where they are parallel.
+
+    `members` (n,) are tracklets. The point is entered in `points`, `InstantPoints`, at instant m;
+    their `normal` and `cov_km2` there are overwritten. `part` (14,) is work space.
+    """
     x, N, inverse = points.x_km[m], points.normal[m], points.cov_km2[m]
     N[:] = 0.0
     part[RHS : RHS + 3] = 0.0
@@ -40,10 +44,11 @@ def _start(views, members, m, points, part):
 
 @borrowing_kernel
 def _add_view(views, i, m, x, N, part):
-    """Add a view to the normal equations (upper half); return its chi-square.
+    """Add a view to the normal equations `N` (3, 3) [km^-2] (upper half); return its chi-square.
 
-    `part` (14,) holds the residual, and the right-hand side from `RHS` on. NaN where the point is
-    behind the sensor.
+    The view is that of tracklet i at instant m, for the point `x` (3,) [km], GCRF. `part` (14,)
+    holds the residual, and the right-hand side from `RHS` on. NaN where the point is behind the
+    sensor.
     """
     if residual(views, i, m, x, part) == 0.0:
         return np.nan
@@ -60,7 +65,11 @@ def _add_view(views, i, m, x, N, part):
 
 @borrowing_kernel
 def _step(x, N, part, P):
-    """Invert N into P and move x; return the decrease of chi-square, NaN where it diverges."""
+    """Invert N into P and move x; return the decrease of chi-square, NaN where it diverges.
+
+    `N` (3, 3) [km^-2], upper half, and the right-hand side in `part` (14,) are those of
+    `_add_view`; `P` (3, 3) [km^2] becomes the covariance of `x` (3,) [km], GCRF.
+    """
     if invert_symmetric(N, P) == 0.0:
         return np.nan
     gain = 0.0
@@ -75,8 +84,9 @@ def _step(x, N, part, P):
 def solve(views, members, points, part):
     """Solve every instant that two members share; return chi-square and degrees of freedom.
 
-    An instant that was solved before (by `points.seen_by`) starts from its point. NaN where an
-    instant has no solution.
+    `members` (n,) are tracklets; `points`, `InstantPoints`, are written; `part` (14,) is work
+    space. An instant that was solved before (by `points.seen_by`) starts from its point. NaN where
+    an instant has no solution.
     """
     X, N, P, seen_by = points
     total, dof = 0.0, 0
@@ -111,7 +121,10 @@ def solve(views, members, points, part):
 
 @borrowing_kernel
 def join(views, c, points, part):
-    """Update the solved points with tracklet c (Kalman); return false where it fails."""
+    """Update the solved points with tracklet c (Kalman); return false where it fails.
+
+    `points`, `InstantPoints`, are changed; `part` (14,) is work space.
+    """
     X, N, P, seen_by = points
     for m in range(len(views.time_s)):
         if not views.seen[c, m]:
@@ -127,7 +140,10 @@ def join(views, c, points, part):
 
 @borrowing_kernel
 def possible(space, members, points):
-    """Return whether the points lie, within 3 sigma, where their sensors can see an object."""
+    """Return whether the points lie, within 3 sigma, where their sensors can see an object.
+
+    `members` (n,) are the tracklets that see them, `points` are `InstantPoints`.
+    """
     views, lowest, farthest = space.views, space.lowest_km, space.farthest_km
     X, _, P, seen_by = points
     for m in range(len(views.time_s)):

@@ -22,10 +22,10 @@ MIN_TRACKLETS = 3  # of an object, before it gains one and after it loses one
 
 @kernel
 def resolve_conflicts(space, work, group, x_km):
-    """Correct `group` (-1: no object) for tracklets that two objects explain.
+    """Correct `group` (t,), -1 for no object, for tracklets that two objects explain.
 
-    Only objects of three tracklets or more take part, and none falls below three.
-    `space.taken` must be all false. `x_km` (g, 3) are the objects' points at their first instant.
+    Only objects of three tracklets or more take part, and none falls below three. `space.taken`
+    must be all false. `x_km` (g, 3) are the objects' points at their first instant.
     """
     views, n_groups = space.views, len(x_km)
     k, n_sensors = len(views.time_s), views.camera.shape[0]
@@ -88,7 +88,10 @@ def resolve_conflicts(space, work, group, x_km):
 
 @borrowing_kernel
 def _enter_points(points, g, X, P, seen_by):
-    """Enter the points of group g."""
+    """Enter the points of group g in `points`, `InstantPoints`.
+
+    Of n groups: `X` (n, k, 3) [km] and `P` (n, k, 3, 3) [km^2], GCRF, and `seen_by` (n, k).
+    """
     for m in range(len(points.seen_by)):
         points.seen_by[m] = seen_by[g, m]
         for a in range(3):
@@ -99,7 +102,7 @@ def _enter_points(points, g, X, P, seen_by):
 
 @borrowing_kernel
 def _two_sensors(views, members):
-    """Return two sensors of a group's members."""
+    """Return two sensors of a group's members (n,); the same one twice if all are of one sensor."""
     a = b = views.sensor[members[0]]
     for i in members:
         b = views.sensor[i] if views.sensor[i] != a else b
@@ -108,7 +111,7 @@ def _two_sensors(views, members):
 
 @borrowing_kernel
 def _has(views, group, s, g):
-    """Return whether sensor s has a tracklet in group g."""
+    """Return whether sensor s has a tracklet in group g; `group` (t,) is that of each tracklet."""
     has = False
     for i in range(views.first[s], views.first[s + 1]):
         has |= group[i] == g
@@ -117,7 +120,11 @@ def _has(views, group, s, g):
 
 @kernel
 def _by_group(group, n_groups):
-    """Return the tracklets sorted by group, and where each group begins."""
+    """Return the tracklets sorted by group, and where each group begins.
+
+    `group` (t,) is -1 for no group. Tracklets of group g are ``members[first[g]:first[g + 1]]`` of
+    the arrays returned, members (n,) and first (n_groups + 1,).
+    """
     first = np.zeros(n_groups + 1, np.int64)
     for g in group:
         if g >= 0:

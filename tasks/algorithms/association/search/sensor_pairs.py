@@ -101,7 +101,10 @@ def _meet_all(cones, steps, a, b):
 
 @borrowing_kernel
 def _meet(cones, steps, a, b):
-    """Return whether the fields of two sensors meet, see `fields_meet`."""
+    """Return whether the fields of two sensors meet, see `fields_meet`.
+
+    `cones` (s, k, 7) as there; `steps` (n,) [km] along the cone of sensor a grow by a fixed ratio.
+    """
     step, common = steps[1] / steps[0], 0
     for m in range(cones.shape[1]):
         common += cones[a, m, TANGENT] > 0.0 and cones[b, m, TANGENT] > 0.0
@@ -139,7 +142,11 @@ def _meet(cones, steps, a, b):
 
 @kernel
 def _overlapping_pairs(index, rank, cones, steps):
-    """Return pairs of sensors, (n, 2); some of them twice."""
+    """Return pairs of sensors, (n, 2); some of them twice.
+
+    Those of which `_meet` finds that they meet, by `cones` (s, k, 7) and `steps` (j,) [km].
+    `rank` (s,) is of `_leaders`.
+    """
     n_sensors, n_cells = len(index.by_sensor_first) - 1, len(index.first) - 1
     leader, occupied = _leaders(index, rank), np.empty(n_cells, np.int64)
     for q in range(n_cells):
@@ -175,7 +182,10 @@ def _overlapping_pairs(index, rank, cones, steps):
 
 @kernel
 def _leaders(index, rank):
-    """Return the sensors with the lowest ranks in each crowded cell, (c, 8); -1 elsewhere."""
+    """Return the sensors with the lowest ranks in each crowded cell, (c, 8); -1 elsewhere.
+
+    `rank` (s,) int is the rank of each sensor.
+    """
     leader = np.full((len(index.first) - 1, N_LEADERS), -1)
     for q in range(len(leader)):
         if index.first[q + 1] - index.first[q] <= FEW_SENSORS + 1:
@@ -214,7 +224,7 @@ def _together(
 
 @kernel
 def _passing(views, sparse, farthest_km):
-    """Return pairs of sensors, (n, 2); some of them twice."""
+    """Return pairs of sensors, (n, 2); some of them twice. Arguments as in `passing_pairs`."""
     n_tracklets, n = len(views.sensor), 0
     row, u = np.empty(n_tracklets, np.int64), np.empty((n_tracklets, 3))
     sigma, out = np.empty((n_tracklets, 2)), np.empty((64, 2), np.int64)
@@ -251,7 +261,9 @@ def _passing(views, sparse, farthest_km):
 def _pass_near(camera_a, u_a, camera_b, u_b, rad, km, farthest_km):
     """Return whether two lines of sight pass within some angle and distance, above the ground.
 
-    Nearly parallel lines always do.
+    Nearly parallel lines always do. `camera_a` and `camera_b` (33,) are rows of `Views.camera`, of
+    which the positions are read [km]; `u_a` and `u_b` (3,) are unit vectors, ICRS. `rad` [rad] and
+    `km` [km] together limit the gap.
     """
     cosine, along_a, along_b = 0.0, 0.0, 0.0
     for x in range(3):
@@ -368,7 +380,13 @@ class SensorPairs:
 
 @borrowing_kernel
 def _next_pair(a, b, always, waiting, covered, busy, enough, begin):
-    """Return the first pair from `begin` on that should seed, its sensors not busy, or -1."""
+    """Return the first pair from `begin` on that should seed, its sensors not busy, or -1.
+
+    The n pairs are of the sensors `a` (n,) and `b` (n,). Those that have not seeded are
+    `waiting` (n,), bool. Of these one seeds if it is flagged in `always` (n,), or if
+    `covered` (n, p), the number of earlier pairs that cover each of its p points, is below `enough`
+    for a point. `busy` (s,) bool flags sensors.
+    """
     for k in range(begin, len(a)):
         if waiting[k] and not busy[a[k]] and not busy[b[k]]:
             if always[k]:
@@ -381,7 +399,21 @@ def _next_pair(a, b, always, waiting, covered, busy, enough, begin):
 
 @kernel
 def _cover(index, a, b, middle, share, points, first, by_cell, covered):
-    """Count the pair of sensors a and b for all points that both have in their field."""
+    """Count the pair of sensors a and b for all points that both have in their field.
+
+    Parameters
+    ----------
+    middle : (s, 3), (s, 3), (s,) float
+        Axes, positions [km] and half-angles [rad] of the fields, see `_middle`.
+    share : (n,) float
+        Part of the half-angle that counts, for each of n pairs.
+    points : (n, p, 3) float
+        Their points [km], GCRF.
+    first, by_cell : (c + 1,), (n p,) int
+        Points of cell q are ``by_cell[first[q]:first[q + 1]]``: pair times p plus point.
+    covered : (n, p) int, in and out
+        The counts.
+    """
     look, position, half = middle
     i, j, n_points = index.by_sensor_first[a], index.by_sensor_first[b], points.shape[1]
     while i < index.by_sensor_first[a + 1] and j < index.by_sensor_first[b + 1]:

@@ -84,7 +84,8 @@ def pair_miss(views, i, j, m, lowest, farthest, ui, uj):
 def _speed(views, i, m, range_km, n0, n1, n2):
     """Return the object's velocity [km/s] along a unit vector, from the rate of tracklet i.
 
-    The vector is perpendicular to the line of sight. 0 where the rate is unknown.
+    The vector (`n0`, `n1`, `n2`), ICRS, is perpendicular to the line of sight. 0 where the rate is
+    unknown.
     """
     cam, see = views.camera[views.sensor[i], m], views.sight[i, m]
     if see[HAS_RATE] == 0.0:
@@ -104,7 +105,10 @@ def _spread(views, i, m):
 
 @borrowing_kernel
 def _across(views, i, m, n0, n1, n2):
-    """Return the variance of a direction along a unit vector across it [rad^2]."""
+    """Return the variance [rad^2] of a direction along a unit vector across it.
+
+    The direction is that of tracklet i at instant m, the vector (`n0`, `n1`, `n2`), ICRS.
+    """
     cam, see = views.camera[views.sensor[i], m], views.sight[i, m]
     a = cam[PLANE] * n0 + cam[PLANE + 1] * n1 + cam[PLANE + 2] * n2
     b = cam[PLANE + 3] * n0 + cam[PLANE + 4] * n1 + cam[PLANE + 5] * n2
