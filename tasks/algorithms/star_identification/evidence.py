@@ -66,7 +66,10 @@ def log_magnitude_density(magnitude: Array) -> Array:
 @borrowing_kernel
 def log_brightness_ratio(difference, magnitude, log_density, scatter):
     """Return ln(g / h) of a match, by its difference of magnitudes and 1-sigma scatter [mag]
-    (compiled)."""
+    (compiled).
+
+    `magnitude` [mag] is the star's, log_density (N_BINS,) as in `MatchRule`.
+    """
     z = difference / scatter
     g = OUTLIER_SHARE / MAG_RANGE
     g += (1.0 - OUTLIER_SHARE) * math.exp(-0.5 * z * z) / (scatter * 2.5066282746310002)
@@ -76,9 +79,10 @@ def log_brightness_ratio(difference, magnitude, log_density, scatter):
 
 @kernel
 def median_zero_point(star_of, instrumental, magnitude):
-    """Return the median of star minus instrumental magnitude over the matches (compiled).
+    """Return the median of star minus instrumental magnitude over the matches [mag] (compiled).
 
-    NaN where fewer than three matches have a flux.
+    NaN where fewer than three matches have a flux. star_of (n,) int64 is each centroid's star, -1
+    none, `instrumental` (n,) its magnitude, NaN unknown; `magnitude` (m,) are those of the stars.
     """
     zero = np.empty(len(star_of))
     n = 0
@@ -189,7 +193,12 @@ def match_evidence(star_of, chi2_of, sigma, instrumental, magnitude, rule, in_vi
 
 @borrowing_kernel
 def _brightness(star_of, instrumental, magnitude, log_density, zero, scatter):
-    """Return ln of how much better stars explain the matches' brightness than chance does."""
+    """Return ln of how much better stars explain the matches' brightness than chance does.
+
+    star_of (n,) int64 is each centroid's star, -1 none, `instrumental` (n,) its magnitude, NaN
+    unknown; `magnitude` (m,) are those of the stars. log_density (N_BINS,) is as in `MatchRule`,
+    `zero` and `scatter` [mag] as its zero_point and `scatter`.
+    """
     total = 0.0
     for k in range(len(star_of)):
         s = star_of[k]
@@ -206,14 +215,20 @@ def _log_determinant(P):
 
 @borrowing_kernel
 def choice_lost(P):
-    """Return the attitude's part of the log evidence, all attitudes equally likely (compiled)."""
+    """Return the attitude's part of the log evidence, all attitudes equally likely (compiled).
+
+    P (3, 3) is the attitude's covariance about the sensor axes [rad^2].
+    """
     return 0.5 * _log_determinant(P) + 1.5 * LN_2PI - math.log(8.0 * math.pi**2)
 
 
 @kernel
 def choice_predicted(P, P0, R, R0):
-    """Return the attitude's part of the log evidence for a prediction R0 with covariance P0,
-    sensor axes (compiled)."""
+    """Return the attitude's part of the log evidence for a prediction (compiled).
+
+    R and R0 (3, 3) are the attitude and the predicted one, sensor from ICRS, P and P0 (3, 3) their
+    covariances about the sensor axes [rad^2].
+    """
     C, inverse = P + P0, np.empty((3, 3))
     determinant = invert_symmetric(C, inverse)
     if determinant <= 0.0:

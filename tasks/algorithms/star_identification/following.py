@@ -111,7 +111,7 @@ class _FieldScratch(NamedTuple):
 
 @borrowing_kernel
 def remember(memory, t_s, R, P):
-    """Enter an identified attitude (compiled)."""
+    """Enter an identified attitude at t_s [s]; R and P (3, 3) as in `Attitude` (compiled)."""
     memory.t_s[0], memory.t_s[1] = memory.t_s[1], t_s
     copy_matrix(memory.R[1], memory.R[0])
     copy_matrix(memory.P[1], memory.P[0])
@@ -122,8 +122,11 @@ def remember(memory, t_s, R, P):
 
 @borrowing_kernel
 def predict(memory, t_s, R, P):
-    """Write attitude and covariance at t_s, extrapolated from the last one or two; return
-    whether the prediction is precise enough to be used (compiled)."""
+    """Write attitude and covariance at t_s [s], extrapolated from the last one or two; return
+    whether the prediction is precise enough to be used (compiled).
+
+    R (3, 3), sensor from ICRS, and P (3, 3), about the sensor axes [rad^2], are written.
+    """
     t_fix, R_fix, P_fix, n_fixes = memory.t_s, memory.R, memory.P, memory.counters[0]
     if n_fixes == 0:
         return False
@@ -151,7 +154,11 @@ def predict(memory, t_s, R, P):
 
 @kernel
 def _rotation_between(A, B):
-    """Return the rotation vector of B A', shorter than pi."""
+    """Return the rotation vector of B A', three numbers [rad] about the sensor axes.
+
+    A and B (3, 3) are attitudes, sensor from ICRS. The vector is not longer than pi. Of half a
+    turn, its direction is not computed.
+    """
     v = np.empty(3)
     trace = 0.0
     for i in range(3):
@@ -170,8 +177,13 @@ def _rotation_between(A, B):
 
 @borrowing_kernel
 def _field_stars(R, reach, beta, stars, memory, scratch):
-    """Write the apparent directions, magnitudes and rows of the stars within `reach` of the
-    boresight; return how many."""
+    """Write the apparent directions, magnitudes and rows of the stars within `reach` [rad] of the
+    boresight to the scratch; return how many.
+
+    R (3, 3) is sensor from ICRS, `beta` (3,) the sensor's velocity over that of light, ICRS axes.
+    `stars` are those of the whole sky. Where those that the memory lists do not suffice, its `near`
+    and `cone` are written.
+    """
     near, cone = memory.near, memory.cone
     dx, dy, dz = R[2, 0] - cone[1], R[2, 1] - cone[2], R[2, 2] - cone[3]
     # A chord is shorter than its angle, by 4 % at a radian.
@@ -192,7 +204,11 @@ def _field_stars(R, reach, beta, stars, memory, scratch):
 
 @inlined_kernel
 def _solve_near(k, frames, stars, rule, memory, scratch, solutions):
-    """Identify frame k near the attitude in `scratch`; return whether its stars confirm it."""
+    """Identify frame k near the attitude in `scratch`; return whether its stars confirm it.
+
+    Arguments as in `follow`; `scratch` is a `_FieldScratch`. Frame k of `solutions` may be written
+    in any case, the attitudes of `memory` only where the stars confirm it.
+    """
     camera = frames.camera[k]
     reach = frames.half_diagonal[camera] + 1e-4
     reach += 4.0 * math.sqrt(max(scratch.P[0, 0], scratch.P[1, 1]))
@@ -225,7 +241,10 @@ def _solve_near(k, frames, stars, rule, memory, scratch, solutions):
 
 @inlined_kernel
 def _identify_next(k, frames, priors, stars, rule, memory, scratch, solutions):
-    """Identify frame k from the frames before it, or from its prior; return whether it was."""
+    """Identify frame k from the frames before it, or from its prior; return whether it was.
+
+    Arguments as in `follow`; `scratch` is a `_FieldScratch`. Writes as `_solve_near` does.
+    """
     for attempt in range(2):
         if attempt == 0:
             if not predict(memory, frames.t_s[k], scratch.R, scratch.P):
@@ -247,7 +266,7 @@ def _identify_next(k, frames, priors, stars, rule, memory, scratch, solutions):
 
 @borrowing_kernel
 def _clear(k, first, solutions):
-    """Erase what attempts left in the solution of frame k."""
+    """Erase what attempts left in the solution of frame k; `first` (F + 1,) as in `FrameArrays`."""
     solutions.R_sensor_from_icrs[k], solutions.cov_rad2[k] = np.nan, np.nan
     solutions.star[first[k] : first[k + 1]] = -1
     solutions.chi2[first[k] : first[k + 1]] = 0.0

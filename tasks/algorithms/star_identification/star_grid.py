@@ -51,7 +51,20 @@ def build_sky_grid(u_icrs: Array, radius_rad: float) -> SkyGrid:
 
 @kernel
 def _visit_cells(u, radius, n, slot, star):
-    """Count each star's cells in `slot`; or enter the stars at the slots, where `star` has room."""
+    """Count each star's cells in `slot`; or enter the stars at the slots, where `star` has room.
+
+    Parameters
+    ----------
+    u : (m, 3) float
+        Unit vectors of the stars, ICRS.
+    radius, n : float, int
+        Radius of the stars' discs [rad], and number of cells along an edge of the cube.
+    slot : (6 n^2,) int32 or longer
+        Each cell's element grows by its number of stars. Where stars are entered, it begins as the
+        first element of `star` for the cell.
+    star : (entries,) int32, out
+        Rows of u, cell by cell; an empty array: stars are only counted.
+    """
     for k in range(len(u)):
         for face in range(6):
             axis = face % 3
@@ -76,7 +89,10 @@ def _visit_cells(u, radius, n, slot, star):
 
 @kernel
 def cell_of(x, y, z, n):
-    """Return the cell of a direction, of any length (compiled)."""
+    """Return the cell in a `SkyGrid` of a direction, ICRS, of any length (compiled).
+
+    n is the number of cells along an edge.
+    """
     ax, ay, az = abs(x), abs(y), abs(z)
     if ax >= ay and ax >= az:
         face, a, b, major = 0 if x > 0 else 3, y, z, ax
@@ -92,7 +108,10 @@ def cell_of(x, y, z, n):
 @borrowing_kernel
 def nearest_star(x, y, z, radius, u_icrs, first, star, n_face):
     """Return the star nearest to a unit vector within `radius` [rad], -1 without one, and the
-    squared chord to it (compiled)."""
+    squared chord to it (compiled).
+
+    u_icrs (m, 3) are the stars' unit vectors, `first`, `star` and n_face those of their `SkyGrid`.
+    """
     cell = cell_of(x, y, z, n_face)
     best, best_d2 = -1, radius * radius
     for m in range(first[cell], first[cell + 1]):
@@ -164,8 +183,8 @@ def cell_at(band, sector):
 
 @borrowing_kernel
 def cells_of_cone(x, y, z, cosine):
-    """Return the cells that hold all within an angle, at most 90 degrees and given by its cosine,
-    of a unit vector (compiled)."""
+    """Return the `ConeCells` that hold all within an angle, at most 90 degrees and given by its
+    cosine, of a unit vector, ICRS (compiled)."""
     sine, along = math.sqrt(1.0 - cosine * cosine), math.sqrt(x * x + y * y)
     low, high = _band(z * cosine - along * sine), _band(z * cosine + along * sine)
     if along <= sine:  # a pole is inside
@@ -178,7 +197,10 @@ def cells_of_cone(x, y, z, cosine):
 @borrowing_kernel
 def find_in_cone(stars, x, y, z, cosine, at):
     """Write where in `stars` those are that lie within an angle of a unit vector; return how many
-    (compiled). The angle is at most 90 degrees and given by its cosine."""
+    (compiled). The angle is at most 90 degrees and given by its cosine.
+
+    `stars` are `StarBands`, the vector is ICRS. `at` (n,) int has room for all n stars.
+    """
     cells, n = cells_of_cone(x, y, z, cosine), 0
     for band in range(cells.low, cells.high + 1):
         for sector in range(cells.left, cells.left + cells.n_sectors):

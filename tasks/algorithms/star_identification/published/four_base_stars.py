@@ -95,7 +95,11 @@ def _tolerance(sigma, i, j, c):
 
 @kernel
 def _same_hand(u, p, s_u, s):
-    """Return whether the first three of the four turn the same way in image and catalogue."""
+    """Return whether the first three of the four turn the same way in image and catalogue.
+
+    p (4,) are rows of the centroids u (n, 3), sensor frame, s (4,) those of their stars in s_u
+    (m, 3), ICRS.
+    """
     measured = np.linalg.det(np.stack((u[p[0]], u[p[1]], u[p[2]])))
     listed = np.linalg.det(np.stack((s_u[s[0]], s_u[s[1]], s_u[s[2]])))
     return measured * listed > 0.0
@@ -105,8 +109,11 @@ def _same_hand(u, p, s_u, s):
 def _common_neighbours(pairs, low, high, counter):
     """Return the neighbours of the stars that stand in all three sets of pairs.
 
-    Set k = 1 .. 3 holds the pairs low[k]:high[k]. Returned are the star, its neighbour, and where
-    the rows of each set begin. `counter` is zero, and zero again afterwards.
+    Set k = 1 .. 3 holds the pairs low[k]:high[k] of `pairs`, a `PairTable`; `low` and `high` are
+    (4,) int64. `counter` (m,) int8, by star, is zero, and zero again afterwards.
+
+    Returns the star and its neighbour, (r,) int64 each, rows of the catalogue, and `bound` (5,)
+    int64: those of set k are bound[k]:bound[k + 1].
     """
     pair_a, pair_b = pairs.first, pairs.second
     for k in range(1, 4):
@@ -141,8 +148,12 @@ def _common_neighbours(pairs, low, high, counter):
 
 @kernel
 def _identities(u, sigma, p, star_u, pairs, counter, out):
-    """Write the quadruples of stars whose six separations are those of centroids p; return
-    how many. `counter` is zero, and zero again afterwards."""
+    """Write the quadruples of stars whose six separations are those of four centroids; return how
+    many, 0 where `out` (q, 4) int64 has too few rows.
+
+    p (4,) are rows of the centroids u (n, 3), sensor frame, with errors `sigma` (n,) [rad]; those
+    of `out` are rows of star_u (m, 3), ICRS. `counter` (m,) int8 is zero before and after.
+    """
     low, high = np.zeros(4, np.int64), np.zeros(4, np.int64)
     for k in range(1, 4):
         c = _chord(u, p[0], u, p[k])
@@ -181,8 +192,12 @@ def _identities(u, sigma, p, star_u, pairs, counter, out):
 
 @kernel
 def _match_rest(u, sigma, p, star_u, s, star):
-    """Write the stars of all centroids by the quadrilateral rule; return how many beside
-    the base stars."""
+    """Write the stars of all centroids by the quadrilateral rule; return how many beside the base
+    stars.
+
+    p and s (4,) are the base stars: rows of the centroids u (n, 3), sensor frame, with errors
+    `sigma` (n,) [rad], and of star_u (m, 3), ICRS. `star` (n,) int64, out: rows of star_u, -1 none.
+    """
     star[:] = -1
     diagonal = 0.0
     for k in range(len(u)):

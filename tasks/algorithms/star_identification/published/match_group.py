@@ -84,7 +84,11 @@ def _chord(a, i, b, j):
 
 @kernel
 def _bins(u, sigma, i, j):
-    """Return the chords between which the bins lie that a separation's error reaches."""
+    """Return the chords between which the bins lie that a separation's error reaches.
+
+    The separation is between rows i and j of the centroids u (n, 3), with errors `sigma` (n,)
+    [rad].
+    """
     angle = 2.0 * math.asin(min(0.5 * _chord(u, i, u, j), 1.0))
     reach = PAIR_GATE * math.sqrt(sigma[i] * sigma[i] + sigma[j] * sigma[j]) + 1.1e-4 * angle
     low = math.floor((angle - reach) / BIN_RAD) * BIN_RAD
@@ -95,7 +99,12 @@ def _bins(u, sigma, i, j):
 @kernel
 def _triangles(u, sigma, star_u, pairs, neighbours_in_order, s, set_low, set_high):
     """Return how many triangles of the main star with two neighbours that follow each other in
-    order are triangles of the catalogue too, if the main star is s."""
+    order are triangles of the catalogue too, if the main star is s, a row of star_u (m, 3), ICRS.
+
+    neighbours_in_order (k,) int64 are rows of the centroids u (n, 3), sensor frame, with errors
+    `sigma` (n,) [rad]. The pairs set_low[q]:set_high[q], (n,) int64, have the separation of the
+    q-th neighbour from the main star.
+    """
     pair_a, pair_b, order = pairs.first, pairs.second, neighbours_in_order
     total = 0
     before = np.empty(0, np.int64)

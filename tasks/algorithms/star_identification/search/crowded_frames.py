@@ -156,7 +156,10 @@ def _shares_inside(u, box, reach):
 
 @kernel
 def _pivots(inside):
-    """Return the order of the pivots, those with most of their surroundings in the image first."""
+    """Return the order of the pivots, those with most of their surroundings in the image first.
+
+    `inside` (n,) is from `_shares_inside`; the order (n,) int64 has rows of the centroids.
+    """
     order = mixed_order(len(inside))
     return order[np.argsort(-np.floor(PIVOT_TIERS * inside[order]), kind="mergesort")]
 
@@ -164,14 +167,21 @@ def _pivots(inside):
 @borrowing_kernel
 def _contradicts(m_s, m_other, q, companions, mag_gate):
     """Return whether companion q is too bright or too faint for a neighbour of magnitude m_other of
-    a star of magnitude m_s. Comparisons with NaN are false."""
+    a star of magnitude m_s. Comparisons with NaN are false.
+
+    mag_gate [mag] is the gate of one magnitude; that of a difference is wider by the root of two.
+    """
     odd = abs(m_s - m_other - companions.difference[q]) > 1.414 * mag_gate
     return odd | (abs(m_other - companions.magnitude[q]) > mag_gate)
 
 
 @borrowing_kernel
 def _roll_votes_of(s, near, magnitude, mag_gate, companions, votes):
-    """Write the votes of star s to `votes`; return their number, the fullest bin, and its votes."""
+    """Write the votes of star s to `votes`; return their number, the fullest bin, and its votes.
+
+    `near` are the `NearStars`, `magnitude` (m,) [mag] those of the catalogue; mag_gate as in
+    `_contradicts`.
+    """
     n, best, most = 0, 0, 0
     votes.in_bin[:] = 0
     for entry in range(near.first[s], near.first[s + 1]):
@@ -240,7 +250,11 @@ def _farthest_agreeing_vote(n, k, near, votes):
 
 @kernel
 def _stars_like(m_i, magnitude, n_stars, mag_gate):
-    """Return the range of stars, brightest first, that a centroid of this magnitude may be."""
+    """Return the range of stars, brightest first, that a centroid of this magnitude may be.
+
+    The range is first and last + 1, of the first n_stars of `magnitude` (m,) [mag], ascending; all
+    of these where m_i is NaN. mag_gate [mag] is the largest difference.
+    """
     if math.isnan(m_i):
         return 0, n_stars
     low = np.searchsorted(magnitude[:n_stars], m_i - mag_gate)
@@ -249,7 +263,10 @@ def _stars_like(m_i, magnitude, n_stars, mag_gate):
 
 @kernel
 def _try_star(problem, i, s, j, other, c, scratch, best):
-    """Try star s for pivot i and star `other` for centroid j, c apart; return the work done."""
+    """Try star s for pivot i and star `other` for centroid j, c apart; return the work done.
+
+    c is the chord between the stars. `scratch`, a `PairScratch`, and `best`, a `Best`, are written.
+    """
     n, n_checked = len(problem.centroids.u), len(scratch.gain)
     order = prepare_pair(problem, i, j, c, scratch)
     log_miss = math.log(1.0 - problem.limits.star_share)
@@ -264,7 +281,9 @@ def _try_star(problem, i, s, j, other, c, scratch, best):
 def _try_pivot(problem, i, inside, step, stars, cells, n_agreeing, votes, scratch, best):
     """Try the stars with most agreeing votes for pivot i; return the work done.
 
-    `inside` : share of the pivot's surroundings that is in the image
+    `inside` is the share of the pivot's surroundings that is in the image, `step` a row of
+    `ROUNDS`; `stars` and `cells` are as in `field_log_odds`. n_agreeing (n_stars,) uint8, `votes`
+    and `scratch` are work space; `best`, a `Best`, is updated.
     """
     near, magnitude = problem.pairs.near, problem.stars.magnitude
     mag_gate = MAG_GATE * problem.rule.scatter

@@ -86,7 +86,8 @@ def try_brightest(problem, scratch, best):
 
 @kernel
 def _try_centroids(problem, i, j, n_bright, scratch, best):
-    """Try two centroids as two of the brightest stars; return the work done."""
+    """Try centroids i and j as two of the n_bright brightest stars; return the work done.
+    `scratch`, a `PairScratch`, and `best`, a `Best`, are written."""
     stars, pairs, n = problem.stars, problem.pairs, len(problem.centroids.u)
     c, tolerance, _, _ = companion(problem.centroids, i, j, problem.limits.min_chord)
     if c == 0.0:
@@ -170,7 +171,9 @@ def matches_needed(problem):
 def _try_counted(problem, i, n_votes, fine, n_tried, votes, refined, min_votes, scratch, best):
     """Try the hypotheses of pivot i with `min_votes` refined votes or more; return the work done.
 
-    Only the votes of the first `n_tried` companions lead to a try.
+    Only the votes of the first `n_tried` companions lead to a try. n_votes and `fine` are from
+    `gather_votes`. False votes are taken back from the bins of `refined`; `scratch`, a
+    `PairScratch`, and `best`, a `Best`, are written.
     """
     centroids, stars, pairs = problem.centroids, problem.stars, problem.pairs
     n, n_checked = len(centroids.u), len(scratch.gain)
@@ -205,7 +208,12 @@ def _try_counted(problem, i, n_votes, fine, n_tried, votes, refined, min_votes, 
 
 @kernel
 def _try_pivot(problem, i, order, min_companions, step, needed, votes, refined, scratch, best):
-    """Try the hypotheses of pivot i with most votes; return the work done."""
+    """Try the hypotheses of pivot i with most votes; return the work done.
+
+    `order` (k,) int64 are rows of the centroids, as in `count_votes`, `step` is a row of `ROUNDS`,
+    and `needed` from `matches_needed`. `votes`, `refined` and `scratch` are work space; `best`, a
+    `Best`, is updated.
+    """
     enough_votes, cells = ROUNDS[step][3], ROUNDS[step][4]
     n_companions, cast, log2 = count_votes(problem, i, order, min_companions, enough_votes, votes)
     work = cast + (problem.pairs.n_stars << log2) // 100
@@ -231,7 +239,7 @@ def _try_pivot(problem, i, order, min_companions, step, needed, votes, refined, 
 
 @kernel
 def mixed_order(n):
-    """Return 0 .. n - 1, taken in turn from the bright end and from the middle.
+    """Return 0 .. n - 1, (n,) int64, taken in turn from the bright end and from the middle.
 
     False centroids are often all bright, or all faint.
     """

@@ -84,7 +84,8 @@ class _SettleScratch(NamedTuple):
 def aberrated(x, y, z, beta, out):
     """Write the direction that an observer at beta (v / c) sees of a unit vector (compiled).
 
-    Explanatory Supplement to the Astronomical Almanac (2013), eq. 7.40.
+    `beta` (3,), the vector and `out` (3,) are on the same axes, ICRS. Explanatory Supplement to the
+    Astronomical Almanac (2013), eq. 7.40.
     """
     p = x * beta[0] + y * beta[1] + z * beta[2]
     g = math.sqrt(1.0 - beta[0] * beta[0] - beta[1] * beta[1] - beta[2] * beta[2])
@@ -97,7 +98,10 @@ def aberrated(x, y, z, beta, out):
 @borrowing_kernel
 def stars_in_cone(u_icrs, n_stars, R, radius, row):
     """Write the rows of those of the first n_stars that are within `radius` [rad] of the boresight;
-    return how many (compiled)."""
+    return how many (compiled).
+
+    u_icrs (m, 3) are unit vectors, R (3, 3) is sensor from ICRS. `row` (n_stars,) int, out.
+    """
     x, y, z, c, n = R[2, 0], R[2, 1], R[2, 2], math.cos(radius), 0
     for s in range(n_stars):
         if x * u_icrs[s, 0] + y * u_icrs[s, 1] + z * u_icrs[s, 2] > c:
@@ -111,7 +115,8 @@ def stars_about(bands, magnitude, R, radius, beta):
     """Return the stars within `radius` [rad], at most 90 degrees, of the boresight as an observer
     at beta sees them, and their rows in the catalogue, in order (compiled).
 
-    `bands` are the stars of the catalogue by cells, `magnitude` (n,) theirs by rows.
+    `bands` are the stars of the catalogue by cells, `magnitude` (n,) theirs by rows. R (3, 3) is
+    sensor from ICRS, `beta` (3,) is on ICRS axes, as the apparent directions are.
     """
     at = np.empty(len(bands.row), np.int32)
     at = at[: find_in_cone(bands, R[2, 0], R[2, 1], R[2, 2], math.cos(radius), at)]
@@ -125,7 +130,8 @@ def stars_about(bands, magnitude, R, radius, beta):
 
 @borrowing_kernel
 def turn_stars(R, a, v):
-    """Write the stars' directions in the sensor frame (compiled)."""
+    """Write directions a (m, 3), ICRS axes, in the sensor frame of R (3, 3) to v (m, 3)
+    (compiled)."""
     for s in range(len(a)):
         for i in range(3):
             v[s, i] = R[i, 0] * a[s, 0] + R[i, 1] * a[s, 1] + R[i, 2] * a[s, 2]
@@ -135,7 +141,7 @@ def turn_stars(R, a, v):
 def count_in_view(v, box):
     """Return how many of the stars, given in the sensor frame, are in the image (compiled).
 
-    `box` is x0, x1, y0, y1 of the image in normalised coordinates.
+    v (m, 3) are the stars; `box` (4,) is x0, x1, y0, y1 of the image in normalised coordinates.
     """
     n = 0
     for s in range(len(v)):
@@ -216,8 +222,9 @@ def _drop_odd(star_of, instrumental, magnitude, zero_point):
 def settle(R, P, s_xy, s_z, centroids, stars, rule, matches):
     """Match, refine, match again until nothing changes; return the number of matches (compiled).
 
-    Starts at R with an error of s_xy across and s_z about the boresight [rad]. R is refined in
-    place; its covariance P and the matches are written. Returns 0 where there is no attitude.
+    Starts at R (3, 3), sensor from ICRS, with an error of s_xy across and s_z about the boresight
+    [rad]. R is refined in place; its covariance P (3, 3) about the sensor axes [rad^2] and the
+    matches are written. `stars` have apparent directions. Returns 0 where there is no attitude.
     """
     n, m = len(centroids.u), len(stars.u)
     scratch = _SettleScratch(
@@ -233,7 +240,7 @@ def settle(R, P, s_xy, s_z, centroids, stars, rule, matches):
 
 @borrowing_kernel
 def _settle_in(scratch, R, P, s_xy, s_z, centroids, stars, rule, matches):
-    """Do what `settle` does, in the given work space."""
+    """Do what `settle` does, in the given work space, a `_SettleScratch`."""
     u, sigma = centroids.u, centroids.sigma
     v, radius, before, owner, contested, A = scratch
     n = len(u)
@@ -265,7 +272,11 @@ def _settle_in(scratch, R, P, s_xy, s_z, centroids, stars, rule, matches):
 
 @borrowing_kernel
 def _nudge(R, u, k, a, s):
-    """Turn R by the smallest rotation that puts star s on centroid k."""
+    """Turn R by the smallest rotation that puts star s on centroid k.
+
+    R (3, 3), sensor from ICRS, changes. u (n, 3) are the centroids, sensor frame, a (m, 3) the
+    stars, ICRS axes.
+    """
     x = R[0, 0] * a[s, 0] + R[0, 1] * a[s, 1] + R[0, 2] * a[s, 2]
     y = R[1, 0] * a[s, 0] + R[1, 1] * a[s, 1] + R[1, 2] * a[s, 2]
     z = R[2, 0] * a[s, 0] + R[2, 1] * a[s, 1] + R[2, 2] * a[s, 2]
@@ -329,8 +340,19 @@ def best_nudge(R0, s_xy, s_z, centroids, a, gate, R):
 
 @kernel
 def _count_hits(u, by_x, x_of, w, reach, r2, nearest):
-    """Return how many centroids, given with their order by x, have a star near: each counts as 1
-    less its squared distance over that of its radius, `r2`."""
+    """Return how many centroids have a star near, each as 1 less its squared distance over r2.
+
+    Parameters
+    ----------
+    u, w : (n, 3), (m, 3) float
+        Centroids and stars, sensor frame. Only x and y are compared.
+    by_x, x_of : (n,) int64, (n,) float
+        Rows of u in order of x, and x in this order.
+    reach : float
+        The largest radius about a centroid [rad].
+    r2, nearest : (n,) float
+        Squared radius about each centroid [rad^2]; work space, written.
+    """
     nearest[:] = r2
     for t in range(len(w)):
         at = np.searchsorted(x_of, w[t, 0] - reach)

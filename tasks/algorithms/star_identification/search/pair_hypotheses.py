@@ -131,15 +131,15 @@ def make_scratch(n, n_checked):
 
 @borrowing_kernel
 def separation(u, i, j):
-    """Return the chord between two of the directions (compiled)."""
+    """Return the chord between rows i and j of the unit vectors u (n, 3) (compiled)."""
     dx, dy, dz = u[j, 0] - u[i, 0], u[j, 1] - u[i, 1], u[j, 2] - u[i, 2]
     return math.sqrt(dx * dx + dy * dy + dz * dz)
 
 
 @borrowing_kernel
 def _basis(a, b, c, F):
-    """Write rows: along the sum of two unit vectors c apart, along the difference, and their
-    cross product."""
+    """Write to F (3, 3) the rows: along the sum of two unit vectors a, b (3,) with the chord c,
+    along their difference b - a, and the cross product of both rows."""
     f, g = 1.0 / math.sqrt(4.0 - c * c), 1.0 / c
     for m in range(3):
         F[0, m], F[1, m] = f * (a[m] + b[m]), g * (b[m] - a[m])
@@ -150,8 +150,8 @@ def _basis(a, b, c, F):
 
 @kernel
 def prepare_pair(problem, i, j, c, scratch):
-    """Fill the scratch for centroids i and j, c apart; return in which order the others are to
-    be looked up (compiled)."""
+    """Fill the scratch for centroids i and j, with the chord c; return in which order the others
+    are to be looked up, (n_checked - 2,) int64 (compiled)."""
     u, sigma, t = problem.centroids.u, problem.centroids.sigma, scratch.t
     image, gate, grid_radius = problem.image, problem.rule.gate, problem.stars.grid.radius_rad
     share = problem.limits.star_share
@@ -179,11 +179,12 @@ def prepare_pair(problem, i, j, c, scratch):
 
 @borrowing_kernel
 def try_pair(stars, a, b, c, order, log_miss, floor, scratch):
-    """Return the log odds of the attitude that puts stars a and b on the pair's centroids,
-    by all other centroids (compiled).
+    """Return the log odds of the attitude that puts stars a and b on the pair's centroids, by all
+    other centroids (compiled).
 
-    A sequential probability ratio test (Wald 1945): it stops as soon as the odds are below
-    `floor`. A centroid without a star adds `log_miss`. Writes F and row_of of the scratch.
+    A sequential probability ratio test (Wald 1945): it stops as soon as the odds are below `floor`.
+    A centroid without a star adds `log_miss`. c is the chord between the stars, `order` is from
+    `prepare_pair`. Writes F and row_of of the scratch.
     """
     F, t = scratch.F, scratch.t
     _basis(stars.u[a], stars.u[b], c, F)
@@ -207,7 +208,7 @@ def try_pair(stars, a, b, c, order, log_miss, floor, scratch):
 
 @borrowing_kernel
 def _attitude(scratch):
-    """Write to R of the scratch the attitude that turns F to E."""
+    """Write to R of the scratch the attitude, sensor from ICRS, that turns F to E."""
     E, F, R = scratch.E, scratch.F, scratch.R
     for r in range(3):
         for m in range(3):
@@ -217,7 +218,11 @@ def _attitude(scratch):
 @borrowing_kernel
 def pair_attitude(u_i, u_j, star_i, star_j, c, scratch):
     """Write to R of the scratch the attitude that puts two stars, c apart, on two centroids
-    (compiled)."""
+    (compiled).
+
+    u_i and u_j (3,) are the centroids' unit vectors, sensor frame, star_i and star_j (3,) the
+    stars', ICRS; c is the chord between the stars. E and F of the scratch are written too.
+    """
     apart2 = (u_i[0] - u_j[0]) ** 2 + (u_i[1] - u_j[1]) ** 2 + (u_i[2] - u_j[2]) ** 2
     _basis(u_i, u_j, math.sqrt(apart2), scratch.E)
     _basis(star_i, star_j, c, scratch.F)
@@ -241,7 +246,11 @@ def judge_pair(problem, i, a, j, b, beaten, scratch):
 
 @borrowing_kernel
 def _look_up(R, centroids, k, radius, stars):
-    """Return the star nearest to centroid k, without aberration, and the squared chord to it."""
+    """Return the star nearest to centroid k, without aberration, and the squared chord to it.
+
+    R (3, 3) is sensor from ICRS. The star is a row of `stars`, a `Stars`, within `radius` [rad]; -1
+    without one.
+    """
     u, beta = centroids.u, centroids.beta
     x = R[0, 0] * u[k, 0] + R[1, 0] * u[k, 1] + R[2, 0] * u[k, 2]
     y = R[0, 1] * u[k, 0] + R[1, 1] * u[k, 1] + R[2, 1] * u[k, 2]
@@ -262,7 +271,10 @@ def _look_up(R, centroids, k, radius, stars):
 
 @borrowing_kernel
 def _stars_in_image(R, beta, stars, box):
-    """Return how many catalogue stars, `StarBands`, are in the image."""
+    """Return how many catalogue stars, `StarBands`, are in the image.
+
+    R (3, 3) is sensor from ICRS; `beta` (3,) as in `Centroids`, `box` (4,) as in `Image`.
+    """
     n = 0
     rx, ry = max(-box[0], box[1]), max(-box[2], box[3])
     c = 1.0 / math.sqrt(1.0 + rx * rx + ry * ry) - 1e-4
@@ -284,7 +296,11 @@ def _stars_in_image(R, beta, stars, box):
 @kernel
 def _judge(problem, beaten, R, P, row_of):
     """Refine an attitude whose first matches are in row_of; return its log evidence, as
-    `judge_pair` does."""
+    `judge_pair` does.
+
+    R (3, 3), sensor from ICRS, its covariance P (3, 3) about the sensor axes [rad^2] and row_of
+    (n,) int64, each centroid's star, -1 none, are written.
+    """
     centroids, stars, rule = problem.centroids, problem.stars, problem.rule
     u, sigma = centroids.u, centroids.sigma
     n = len(u)
@@ -357,13 +373,14 @@ class Best(NamedTuple):
 
 @kernel
 def no_attitude(R):
-    """Return the best attitude before any is found; it will be written to R (compiled)."""
+    """Return the best attitude before any is found; it will be written to R (3, 3) (compiled)."""
     return Best(np.array([-1e9, -1e9]), np.zeros(1, np.bool_), R)
 
 
 @borrowing_kernel
 def keep(evidence, problem, scratch, best):
-    """Enter the attitude judged last if it is the best, or the best that differs from the best."""
+    """Enter the attitude judged last, R of the scratch, into `best` if it is the best, or the
+    best that differs from the best. `evidence` is its log evidence."""
     top, R = best.evidence, scratch.R
     if evidence <= top[1]:
         return
@@ -384,7 +401,11 @@ def keep(evidence, problem, scratch, best):
 
 @borrowing_kernel
 def _is_clustered(u, row_of, box):
-    """Return whether more than half of the matches are near one of them."""
+    """Return whether more than half of the matches are near one of them.
+
+    u (n, 3) are the centroids, sensor frame, row_of (n,) int64 their stars, -1 none, and `box` (4,)
+    is as in `Image`.
+    """
     near = CLUSTER * max(box[1] - box[0], box[3] - box[2])
     matches = 0
     for star in row_of:

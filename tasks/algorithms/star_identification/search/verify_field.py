@@ -79,7 +79,8 @@ def make_centroid_cells(u, box):
 
 @borrowing_kernel
 def _has_centroid(x, y, radius, cells):
-    """Return whether a centroid is within a radius of x, y, in normalised image coordinates."""
+    """Return whether one of the `CentroidCells` is within a radius of x, y, in normalised image
+    coordinates."""
     corner, per_cell = cells.corner, cells.per_cell
     left = _cell(x - radius, corner[0], per_cell[0])
     right = _cell(x + radius, corner[0], per_cell[0])
@@ -131,7 +132,11 @@ def field_log_odds(problem, i, s, j, other, c, stars, cells, scratch):
 
 @borrowing_kernel
 def _ratio_of_star(star, z, R, box, pair, cells):
-    """Return the likelihood ratio of one star, 1 outside the image; z is along the boresight."""
+    """Return the likelihood ratio of one star, 1 outside the image; z is along the boresight.
+
+    `star` (3,) is its unit vector, ICRS, z its third component in the sensor frame. R (3, 3) is
+    sensor from ICRS; `box` (4,) as in `Image`.
+    """
     x = (R[0, 0] * star[0] + R[0, 1] * star[1] + R[0, 2] * star[2]) / z
     y = (R[1, 0] * star[0] + R[1, 1] * star[1] + R[1, 2] * star[2]) / z
     if not (box[0] < x < box[1] and box[2] < y < box[3]):

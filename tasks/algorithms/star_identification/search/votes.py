@@ -108,7 +108,8 @@ def implied_magnitudes(problem, i, j):
 def contradicts_brightness(magnitude, a, b, m_i, m_j, m_ij, mag_gate):
     """Return whether the brightness of two centroids contradicts two stars (compiled).
 
-    a, b : rows of the stars. m_i, m_j, m_ij : as from `implied_magnitudes`. mag_gate : [mag]
+    magnitude : (stars,), of the catalogue [mag]. a, b : rows of the stars. m_i, m_j, m_ij : as from
+    `implied_magnitudes`. mag_gate : [mag]
     """
     m_a, m_b = magnitude[a], magnitude[b]
     # Comparisons with NaN are false.
@@ -126,10 +127,10 @@ def possible_ways(m_ij, mag_gate):
 
 @borrowing_kernel
 def count_votes(problem, i, order, min_companions, enough_votes, votes):
-    """Count the votes of pivot i's companions (compiled).
+    """Count the votes of pivot i's companions in `votes` (compiled).
 
-    Companions are taken in `order`: at least `min_companions`, and more until there are more than
-    `enough_votes`. Centroids too close to the pivot are skipped.
+    Companions are taken in `order` (k,) int64, rows of the centroids: at least `min_companions`,
+    and more until there are more than `enough_votes`. Centroids too close to the pivot are skipped.
 
     Returns
     -------
@@ -160,7 +161,7 @@ def count_votes(problem, i, order, min_companions, enough_votes, votes):
 
 @borrowing_kernel
 def _vote(problem, i, m, log2, votes):
-    """Count the votes of the pivot's m-th companion."""
+    """Count the votes of the pivot's m-th companion, in 2^log2 bins of roll of each star."""
     pairs, magnitude = problem.pairs, problem.stars.magnitude
     m_i, m_j, m_ij = implied_magnitudes(problem, i, votes.companion[m])
     mag_gate = MAG_GATE * problem.rule.scatter
@@ -176,7 +177,11 @@ def _vote(problem, i, m, log2, votes):
 
 @borrowing_kernel
 def _cast(star, turn, wide, log2, votes):
-    """Count one vote for a star in each cell of roll that its tolerance touches."""
+    """Count one vote for a star in each cell of roll that its tolerance touches.
+
+    `turn` and `wide` are the roll and its tolerance, in parts of `TURN`. `cast` and `reached` of
+    `votes` are written.
+    """
     shift, mask = 16 - log2, (1 << log2) - 1
     for k in range((turn - wide) >> shift, ((turn + wide) >> shift) + 1):
         cell = (star << log2) + (k & mask)
