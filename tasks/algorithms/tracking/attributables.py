@@ -80,7 +80,10 @@ def attributables(
 
 @kernel
 def _fit_all(rows, at_s, time_s, u, noise, out):
-    """Write the attributables of all tracklets to `out`; arguments as in `attributables`."""
+    """Write the attributables of all tracklets to `out`; arguments as in `attributables`.
+
+    u and `noise` are its u_icrs and cov_noise.
+    """
     frame, derivatives = np.empty((3, 3)), np.empty((ORDER + 1, 2))
     N, rhs = np.empty((N_ROWS, N_ROWS)), np.empty(N_ROWS)
     for k in range(len(at_s)):
@@ -110,9 +113,11 @@ def _fit_all(rows, at_s, time_s, u, noise, out):
 
 @kernel
 def _frame(t, u, lo, hi, at, frame):
-    """Write axes along the motion, across it, and towards the detection nearest to `at`.
+    """Write axes along the motion, across it, and towards the detection nearest to `at` [s].
 
-    Returns the rate [rad/s] from the first to the last detection, 0 with one.
+    The axes are the rows of `frame` (3, 3), ICRS. The detections are lo:hi of their times t (n,)
+    [s] and directions u (n, 3), ICRS. Returns the rate [rad/s] from the first to the last of them,
+    0 with one.
     """
     nearest = lo
     for k in range(lo, hi):
@@ -152,9 +157,15 @@ def _offset(u, frame, xy, J):
 
 @kernel
 def _solve(t, u, noise, lo, hi, at, rate, widening, frame, N, rhs):
-    """Solve for the scaled derivatives, along and across in turn; N becomes its factor.
+    """Solve for the scaled derivatives at the time `at` [s]; N becomes its factor.
 
-    Returns the time [s] by which the derivatives are scaled, and chi-square with the priors.
+    The detections are lo:hi of their times t (n,) [s], directions u (n, 3), ICRS, and errors
+    `noise` (n, 3, 3) [rad^2]. `frame` (3, 3) is from `_frame`; `rate` [rad/s] and `widening` set
+    the priors. N (N_ROWS, N_ROWS) is the normal matrix. `rhs` (N_ROWS,) [rad] receives the
+    derivatives of order m times the m-th power of the scale: along the motion in element 2 m,
+    across it in 2 m + 1.
+
+    Returns the scale [s], and chi-square with the priors.
     """
     N[:], rhs[:] = 0.0, 0.0
     scale, chi2 = 1e-3, 0.0
@@ -188,7 +199,8 @@ def _solve(t, u, noise, lo, hi, at, rate, widening, frame, N, rhs):
 def _add_prior(rate, widening, scale, N):
     """Add the priors of the derivatives from the second one on, along and across the motion.
 
-    Without gravity a path is a great circle: nothing bends it across.
+    N (N_ROWS, N_ROWS) is that of `_solve`, `rate` in [rad/s], `scale` in [s]. Without gravity a
+    path is a great circle: nothing bends it across.
     """
     faster = widening * (rate + LOW_ORBIT_S + 2 * approach(rate))
     along, across = widening * acceleration(rate), widening * (LOW_ORBIT_S * rate + FAR_RAD_S2)
@@ -211,7 +223,12 @@ def _turn(frame, offset):
 
 @kernel
 def _write(frame, derivatives, L, scale, out, k):
-    """Write direction, rate and covariance, from the frame's axes to east and north."""
+    """Write direction, rate and covariance, from the frame's axes to east and north.
+
+    `frame` (3, 3) has the axes as rows, ICRS; `derivatives` (ORDER + 1, 2) are along and across
+    [rad, rad/s ...]; L (N_ROWS, N_ROWS) and `scale` [s] are from `_solve`. Writes row k of `out`,
+    the `Attributables`.
+    """
     out.u[k] = frame[2]
     out.w[k] = derivatives[1, 0] * frame[0] + derivatives[1, 1] * frame[1]
     x, y = frame[2, 0], frame[2, 1]

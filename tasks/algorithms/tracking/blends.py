@@ -161,7 +161,11 @@ def _usual_flux(tracked: TrackedDetections, blended: Flags) -> Array:
 
 @kernel
 def _separations(u, by_frame, starts, width, n_bins):
-    """Return the number of pairs of detections of a frame by their separation, (n_bins,)."""
+    """Return the number of pairs of detections of a frame by their separation, (n_bins,).
+
+    u (n, 3) are the directions, `width` [rad] that of a bin. Frame k has the detections
+    by_frame[starts[k]:starts[k + 1]]: by_frame (n,) int, `starts` (f + 1,) int for f frames.
+    """
     out = np.zeros(n_bins, np.int64)
     for f in range(len(starts) - 1):
         for q in range(starts[f], starts[f + 1]):
@@ -177,7 +181,13 @@ def _separations(u, by_frame, starts, width, n_bins):
 
 @kernel
 def _enter_blends(time, u, tracklet, by_frame, starts, bounds, frame_s, ends, blend_rad, out):
-    """Write the variance of each detection's possible blends to `out` (n,)."""
+    """Write the variance [rad^2] of each detection's possible blends to `out` (n,).
+
+    `time`, u and `bounds` are the times, directions and `bounds` of `TrackedDetections`, `tracklet`
+    (n,) int the tracklet of each detection, by_frame and `starts` as in `_separations`. frame_s
+    (f,) [s] are the times of the frames, `ends` the `_TrackletEnds`. Images blend within blend_rad
+    [rad].
+    """
     p = np.empty(3)
     for b in range(len(bounds) - 1):
         k = bounds[b]
@@ -222,8 +232,10 @@ def _distance(u, p):
 def _predict(time, u, bounds, ends, b, k, at, p):
     """Write the direction of tracklet b at a time without a detection; return its variance.
 
-    The variance is per axis; `k` is the next detection. Between two detections the direction is
-    interpolated.
+    `time` (n,) [s], u (n, 3) and `bounds` (t + 1,) are of `TrackedDetections`, `ends` the
+    `_TrackletEnds`. p (3,) receives the direction at `at` [s], nearly a unit vector. The variance
+    [rad^2] is per axis; `k` is the row of the next detection. Between two detections the direction
+    is interpolated.
     """
     if bounds[b] < k < bounds[b + 1]:
         x = (at - time[k - 1]) / (time[k] - time[k - 1])
@@ -241,7 +253,10 @@ def _predict(time, u, bounds, ends, b, k, at, p):
 
 @kernel
 def _coexist(time, bounds, ends, a, b):
-    """Return whether two tracklets are two objects: both have detections at the same times."""
+    """Return whether two tracklets are two objects: both have detections at the same times.
+
+    `time` (n,) [s] and `bounds` (t + 1,) are of `TrackedDetections`, `ends` the `_TrackletEnds`.
+    """
     if a == b:
         return False
     start, end = max(ends.time[a, 0], ends.time[b, 0]), min(ends.time[a, 1], ends.time[b, 1])

@@ -60,8 +60,10 @@ FEW_PAIRS = 50_000
 class Detections(NamedTuple):
     """Detections of one sensor; frame k has the rows offsets[k]:offsets[k + 1].
 
-    times, offsets : (f,) float, (f + 1,) int64, of frames
-    frame_of, directions, variances : (n,) int64, (n, 3), (n,) float, of detections
+    times, offsets : (f,) float [s], (f + 1,) int64, of frames
+    frame_of, directions, variances : (n,) int64, (n, 3), (n,) float, of detections: rows of the
+        frames, unit vectors, and variances per axis [rad^2]. The axes are those of ICRS, or move
+        with the common motion; all times are then in units of `COMMON_FACTOR` [s]
     track : (n,) int64, the track of each detection, NONE while it is free; kernels write it
     """
 
@@ -77,7 +79,8 @@ class RecentFrames(NamedTuple):
     """The newest frames: frame f is in slot f modulo the number of slots.
 
     grids : see `sky_filter.make_grids`
-    smallest, largest : (slots,) float, minimum and maximum variance of each frame's detections
+    smallest, largest : (slots,) float, minimum and maximum variance [rad^2] of each frame's
+        detections
     """
 
     grids: tuple[Array, Array, Indices, Indices]
@@ -169,7 +172,8 @@ class _ChainScratch(NamedTuple):
 def _free_density(f, depth, detections, field_sr):
     """Return free detections per steradian in frame f and up to depth - 1 frames before it.
 
-    Newest first. A frame without free detections counts as a frame with one.
+    (depth,) or (f + 1,) where there are fewer frames; newest first. A frame without free detections
+    counts as a frame with one.
     """
     offsets = detections.offsets
     out = np.empty(min(depth, f + 1))
@@ -198,6 +202,9 @@ def _max_evidence(f, g, times, density, variance, class_rates, occurring):
     Row c is for a class of rate, column k for the frames g - 1 - k and earlier. It is an upper
     bound: it assumes a chain without a miss, and the lowest rate of the class, which is predicted
     best. Rows of classes that are not `occurring` (N_RATES,) are zero.
+
+    `times` [s] are those of all frames; `density` [1/sr] is from `_free_density`, class_rates
+    (N_RATES + 1,) [rad/s] from `_class_rates`. `variance` [rad^2] is the smallest of a detection.
     """
     n_back = len(density) - (f - g) - 1
     out = np.zeros((N_RATES, n_back + 1))
@@ -225,9 +232,10 @@ def _max_evidence(f, g, times, density, variance, class_rates, occurring):
 
 @kernel
 def _nearest_free(u, variance, detections, recent, slot, gate2):
-    """Return the free detection of a frame nearest to u, by chi-square, and that chi-square.
+    """Return the free detection of a frame nearest to u (3,), by chi-square, and that chi-square.
 
-    NONE and `gate2` if no free detection is within the gate. `variance` [rad^2] is that of u.
+    NONE and `gate2` if no free detection is within the gate. `variance` [rad^2] is that of u,
+    `slot` that of the frame in `recent`.
     """
     directions, variances, track = detections.directions, detections.variances, detections.track
     start, items = recent.grids[2], recent.grids[3]
@@ -323,6 +331,9 @@ def _fastest(best, class_rates, wanted, dt, pairs_sr, rule):
     """Return the maximum rate to search for [rad/s].
 
     Up to it, chains can reach the evidence `wanted`, and the number of pairs is within the limit.
+    `best` (N_RATES, k) is from `_max_evidence`, class_rates (N_RATES + 1,) [rad/s] from
+    `_class_rates`. `dt` [s] is the time between the frames, pairs_sr the number of their pairs per
+    steradian of the disc about a detection in which the other may lie.
     """
     top = 0.0
     for c in range(N_RATES):
@@ -344,7 +355,10 @@ def _class_of(rate, max_rate):
 
 @kernel
 def _occurring_rates(f, g, detections, density, rule):
-    """Return the classes of rate of the pairs of two frames, (N_RATES,) bool; all if many pairs."""
+    """Return the classes of rate of the pairs of two frames, (N_RATES,) bool; all if many pairs.
+
+    `density` [1/sr] is from `_free_density`.
+    """
     offsets, track = detections.offsets, detections.track
     out = np.zeros(N_RATES, np.bool_)
     if density[0] * density[f - g] * rule.field_sr**2 > FEW_TO_CLASSIFY:
@@ -405,7 +419,8 @@ def _try_pair(pair, detections, recent, rule, evidence, chains, scratch):
 
 @kernel
 def _try_pairs(f, g, reach, detections, recent, rule, evidence, chains):
-    """Follow all pairs within `reach` [rad]; keep the strongest chain of each detection of f."""
+    """Follow all pairs of f and g within `reach` [rad]; keep in `chains`, the `_Chains`, the
+    strongest chain of each detection of f."""
     directions, track = detections.directions, detections.track
     scratch = _ChainScratch(
         np.empty(3),
@@ -436,7 +451,8 @@ def _try_pairs(f, g, reach, detections, recent, rule, evidence, chains):
 def _useful_depth(best, wanted):
     """Return the number of frames back in which a chain is followed.
 
-    In these, the slowest object reaches the evidence `wanted` even with one miss.
+    In these, the slowest object reaches the evidence `wanted` even with one miss. `best`
+    (N_RATES, k) is from `_max_evidence`.
     """
     n_back = best.shape[1] - 1
     for k in range(1, n_back):
@@ -448,7 +464,10 @@ def _useful_depth(best, wanted):
 
 @kernel
 def _strongest_chains(f, depth, detections, recent, rule):
-    """Return the strongest chain of each detection of frame f."""
+    """Return the strongest chain of each detection of frame f, as `_Chains`.
+
+    Chains are followed over `depth` frames or more, f included, as far as there are frames.
+    """
     n, longest = detections.offsets[f + 1] - detections.offsets[f], len(recent.largest) - 1
     times, field_sr = detections.times, rule.field_sr
     chains = _Chains(np.zeros(n, np.int64), np.full(n, -np.inf), np.full((n, longest), NONE))

@@ -18,7 +18,12 @@ BIAS_SHARE = 0.25  # maximum error by the neglected third derivative, in sigmas 
 
 
 class _Queries(NamedTuple):
-    """The arguments of `directions_at` that say which directions are computed."""
+    """The arguments of `directions_at` that say which directions are computed.
+
+    first, last : (q,) int64, the rows of the detections that each query may use, first:last
+    at : (q,) float, times [s]
+    unknown_rate, max_half : [rad/s], [s]
+    """
 
     first: Integers
     last: Integers
@@ -28,7 +33,12 @@ class _Queries(NamedTuple):
 
 
 class _MotionDetections(NamedTuple):
-    """Times (n,), directions (n, 3), and errors (n, 3, 3), independent and shared; their traces."""
+    """Detections.
+
+    t, u : (n,), (n, 3) float, times [s] and unit vectors, ICRS
+    noise, bias : (n, 3, 3) float, errors [rad^2], independent and shared
+    noise_trace, bias_trace : (n,) float, their traces [rad^2]
+    """
 
     t: Array
     u: Array
@@ -39,7 +49,7 @@ class _MotionDetections(NamedTuple):
 
 
 class _MotionFits(NamedTuple):
-    """What `directions_at` returns."""
+    """What `directions_at` returns, as in `LocalMotion`, but u is not yet normalised."""
 
     u: Array
     w: Array
@@ -91,8 +101,10 @@ def _coefficients(t, weight, scale, curvature_prior, value, slope):
     """Fill the coefficients of the polynomial's value and slope at t = 0; return the value's
     variance for detections of variance 1 / weight, with the prior's part.
 
-    `curvature_prior` is the weight of a zero second derivative, in the units of `weight`
-    and of time over `scale`. It decides the curvature where the detections do not.
+    t (n,) [s], from the query on, and `weight` (n,) [1/rad^2] are of the detections; `value` (n,)
+    and `slope` (n,) [1/s] are written; `scale` is in [s], the variance in [rad^2].
+    `curvature_prior` is the weight of a zero second derivative, in the units of `weight` and of
+    time over `scale`. It decides the curvature where the detections do not.
     """
     S = np.zeros((3, 3))
     for k in range(len(t)):
@@ -134,10 +146,12 @@ def detections_about(t, first, last, at, half):
 
 @kernel
 def _window(t, u, first, last, at, sigma, max_half):
-    """Return the part of first:last that is fitted, the rate [rad/s] and the half-width.
+    """Return the part of first:last that is fitted, the rate [rad/s] and the half-width [s].
 
-    Three detections are kept, however slow the sensor or fast the object. The prior covers the
-    curvature, and a window beyond the half-width adds to the error.
+    t (n,) [s] and u (n, 3) are times and directions of the detections, `at` [s] is the time of the
+    query, `sigma` [rad] the error of a detection. Three detections are kept, however slow the
+    sensor or fast the object. The prior covers the curvature, and a window beyond the half-width
+    adds to the error.
     """
     lo, hi = detections_about(t, first, last, at, max_half)
     rate = 0.0
@@ -163,7 +177,11 @@ def _nearest(t, first, last, at):
 @kernel
 def _fit(detections, lo, hi, at, rate, half, unknown_rate):
     """Return the coefficients of value and slope at a time, and the variance that neither noise nor
-    bias explains."""
+    bias explains.
+
+    The coefficients are those of the detections lo:hi, (hi - lo,) and (hi - lo,) [1/s], the
+    variance is per axis [rad^2]. `at` and `half` are in [s], `rate` and unknown_rate in [rad/s].
+    """
     n = hi - lo
     tau, weight = detections.t[lo:hi] - at, np.empty(n)
     smallest = np.inf
@@ -190,7 +208,11 @@ def _fit(detections, lo, hi, at, rate, half, unknown_rate):
 
 @kernel
 def _enter_errors(q, lo, value, unmodelled, detections, fits):
-    """Write the propagated errors of query q, fitted to the detections from `lo` on."""
+    """Write the propagated errors of query q, fitted to the detections from `lo` on.
+
+    `value` (k,) are the coefficients of the detections, `unmodelled` [rad^2] is from `_fit`. Writes
+    row q of `noise` and `bias` of `fits`.
+    """
     noise, bias = detections.noise, detections.bias
     # One error, larger in some frames than in others (0 where stars gave the attitude): it
     # adds up with its signs, and its square is never negative.

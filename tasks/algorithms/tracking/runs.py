@@ -67,7 +67,7 @@ class _Tracks(NamedTuple):
     """States of tracks.
 
     u, w, bend, P : (t, 3), (t, 3), (t, 3), (t, SIZE) float, see `sky_filter`
-    at, missed : (t,) float and int64, time of the state, and misses in a row
+    at, missed : (t,) float and int64, time of the state [s], and misses in a row
     strays : (t,) float, false detections expected in the gates since the last detection
     """
 
@@ -279,7 +279,10 @@ def _fill_frame(f, detections, recent):
 
 @kernel
 def _assign(f, live, tracks, detections, recent, rule):
-    """Move the live tracks to frame f, give them its detections and correct them."""
+    """Move the live tracks to frame f, give them its detections and correct them.
+
+    `live` (l,) int64 are rows of `tracks`, ascending. Writes `tracks` and `detections.track`.
+    """
     u, w, bend, P = tracks.u, tracks.w, tracks.bend, tracks.P
     time = detections.times[f]
     for m in live:
@@ -307,7 +310,11 @@ def _assign(f, live, tracks, detections, recent, rule):
 
 @kernel
 def _candidates(f, live, tracks, detections, recent, rule):
-    """Return all (track, detection, chi-square) within the gates of the tracks in frame f."""
+    """Return all (track, detection, chi-square) within the gates of the tracks in frame f.
+
+    They are (c,) int64, int64 and float; `live` (l,) int64 are rows of `tracks`. Writes their
+    `strays`.
+    """
     slot, n_in = f % len(recent.largest), detections.offsets[f + 1] - detections.offsets[f]
     density = n_in / rule.field_sr
     start, items = recent.grids[2], recent.grids[3]
@@ -368,8 +375,8 @@ def _exchange(live, tracks, detections, candidates, assigned, gate2):
     """Exchange the detections of two tracks where both together then fit better.
 
     Predictions of neighbours may all be off to one side. Then the nearest detection is often the
-    neighbour's. `candidates` are row in `live`, detection and chi-square; `assigned` (len(live),)
-    the detection of each live track. Changes `assigned` and `detections.track`.
+    neighbour's. `candidates` are row in `live`, detection and chi-square, (c,) each; `assigned`
+    (len(live),) the detection of each live track. Changes `assigned` and `detections.track`.
     """
     row, detection, chi2 = candidates
     for p in range(len(row)):
@@ -393,7 +400,11 @@ def _chi2(tracks, m, detections, j):
 
 @kernel
 def _state_of(members, detections, u, w, bend, P):
-    """Filter a new track's detections, newest first in `members`, into its state at the newest."""
+    """Filter a new track's detections, newest first in `members`, into its state at the newest.
+
+    `members` (k,) int64 are two detections or more. The state u, w, bend (3,) and P (6,), see
+    `begin`, is written.
+    """
     times, frame_of = detections.times, detections.frame_of
     directions, variances = detections.directions, detections.variances
     last = len(members) - 1

@@ -97,7 +97,7 @@ def distance2(a, b):
 def advance(u, w, bend, dt):
     """Move direction u and rate w by dt along their great circle, with the acceleration `bend`.
 
-    All three change in place.
+    u (3,), w (3,) [rad/s] and `bend` (3,) [rad/s^2] change in place; dt is in [s].
     """
     rate = rate_of(w)
     angle = rate * dt
@@ -115,7 +115,7 @@ def advance(u, w, bend, dt):
 
 @kernel
 def _straighten(u, w, bend):
-    """Make u a unit vector, and w and bend perpendicular to it, in place."""
+    """Make u (3,) a unit vector, and w and bend (3,) perpendicular to it, in place."""
     norm = 0.0
     for a in range(3):
         norm += u[a] * u[a]
@@ -132,9 +132,9 @@ def _straighten(u, w, bend):
 
 @kernel
 def grow(P, rate, bend, dt):
-    """Let the covariance grow over dt, which may be negative.
+    """Let the covariance P (6,) grow over dt [s], which may be negative.
 
-    `bend` is the size of the estimated acceleration [rad/s^2].
+    `rate` [rad/s] is the apparent rate, `bend` the size of the estimated acceleration [rad/s^2].
     """
     j = jerk_of(rate, bend) * dt
     half = 0.5 * dt * dt
@@ -150,7 +150,7 @@ def grow(P, rate, bend, dt):
 
 @kernel
 def shrink(P, variance):
-    """Update P by a measured direction of this variance [rad^2].
+    """Update P (6,) by a measured direction of this variance [rad^2].
 
     Returns the gains of direction, rate [1/s] and acceleration [1/s^2] (Kalman).
     """
@@ -167,7 +167,8 @@ def shrink(P, variance):
 
 @kernel
 def correct(u, w, bend, P, measured, variance):
-    """Update u, w, bend and P in place by a direction `measured` (3,) of a variance [rad^2]."""
+    """Update u, w, bend (3,) and P (6,) in place by a direction `measured` (3,) of a variance
+    [rad^2]."""
     gain_u, gain_w, gain_bend = shrink(P, variance)
     for a in range(3):
         difference = measured[a] - u[a]
@@ -179,7 +180,7 @@ def correct(u, w, bend, P, measured, variance):
 
 @kernel
 def begin_covariance(rate, dt, var_1, var_2, P):
-    """Set P to the covariance at the second of two detections, dt [s] apart.
+    """Set P (6,) to the covariance at the second of two detections, dt [s] apart.
 
     `rate` [rad/s] bounds the acceleration; var_1 and var_2 [rad^2] are the detections' variances.
     """
@@ -194,7 +195,9 @@ def begin_covariance(rate, dt, var_1, var_2, P):
 def begin(u_1, t_1, var_1, u_2, t_2, var_2, u, w, bend, P):
     """Set u, w, bend, P to the state at the second of two detections.
 
-    u_1, u_2 (3,) are the directions, t_1, t_2 their times, var_1, var_2 [rad^2] their variances.
+    u_1, u_2 (3,) are the directions, t_1, t_2 [s] their times, var_1, var_2 [rad^2] their
+    variances. The state is the direction u (3,), its rate w (3,) [rad/s], the acceleration `bend`
+    (3,) [rad/s^2], here zero, and their covariance per axis P (6,).
     """
     dt = t_2 - t_1
     cosine = u_1[0] * u_2[0] + u_1[1] * u_2[1] + u_1[2] * u_2[2]
@@ -267,7 +270,10 @@ def _along(u, axis):
 
 @kernel
 def fill_grid(grids, slot, directions, lo, hi):
-    """Enter the detections lo:hi of a frame, rows of `directions` (n, 3), into a slot."""
+    """Enter the detections lo:hi of a frame, rows of `directions` (n, 3), into a slot.
+
+    `grids` are from `make_grids`; their slot is written.
+    """
     axes, shape, start, items = grids
     n = hi - lo
     side = max(min(int(np.sqrt(n)), int(np.sqrt(start.shape[1] - 1))), 1)
@@ -299,10 +305,11 @@ def fill_grid(grids, slot, directions, lo, hi):
 
 @kernel
 def window(grids, slot, u, reach):
-    """Return the cells within `reach` of a direction: x from, to, y from, to, side.
+    """Return the cells within `reach` of a direction u (3,): x from, to, y from, to, side.
 
-    The cells x from .. to of a row y hold the items start[y * side + x from] to
-    start[y * side + x to + 1]. Empty (x from above x to) outside the grid.
+    `grids` are from `make_grids`; `reach` is a chord [rad]. The cells x from .. to of a row y hold
+    the items start[y * side + x from] to start[y * side + x to + 1]. Empty (x from above x to)
+    outside the grid.
     """
     axes, shape = grids[0], grids[1]
     side = int(shape[slot, 3])

@@ -47,9 +47,12 @@ class _Ends(NamedTuple):
 
     S[:, k] = sum w t^k, B[:, k] = sum w t^k (u - u0), C = sum w (u - u0)(u - u0)', with
     w = 1 / sigma^2 [rad^-2] and t [s] from the time t0. At the end itself: time `at` [s],
-    direction `u` (3,), rate `w` (3,) [rad/s]
-    with their variances (infinite for the rate of a single detection), and `extra`, the square
-    of the acceleration beyond noise and beyond the bound that the rate sets.
+    direction `u` (3,), rate `w` (3,) [rad/s] with their variances (infinite for the rate of a
+    single detection), and `extra`, the square of the acceleration beyond noise and beyond the
+    bound that the rate sets [rad^2/s^4].
+
+    Of g fragments, S is (g, 7), B (g, 4, 3), C (g, 3, 3); directions and rates are (g, 3), ICRS;
+    all others are (g,).
     """
 
     t0: Array
@@ -76,7 +79,12 @@ class _FitScratch(NamedTuple):
 
 
 class _Plane(NamedTuple):
-    """A tangent plane and a common time: axes, a straight drift, that time, unit of time [s]."""
+    """A tangent plane and a common time.
+
+    e_1, e_2 : (3,) float, axes of the plane, ICRS
+    drift : (3,) float, a straight motion [rad/s]
+    centre, scale : the common time, and the unit of time about it [s]
+    """
 
     e_1: Array
     e_2: Array
@@ -108,8 +116,9 @@ def _sums(fragments, lo, hi, ends, f):
 def _excess_acceleration2(S, B, half, bend):
     """Return the square [rad^2/s^4] of a fragment's acceleration beyond its noise and bound.
 
-    `half` [s] is half its length, `bend` [rad/s^2] the bound that its rate sets. The bound fails
-    for a near object that approaches head-on: it is slow at first and soon fast.
+    S (7,) and B (4, 3) are its sums, see `_Ends`; `half` [s] is half its length, `bend` [rad/s^2]
+    the bound that its rate sets. The bound fails for a near object that approaches head-on: it is
+    slow at first and soon fast.
     """
     # Time in units of the half-length, and a parabola free of value and slope.
     s_0, s_1, s_2 = S[0], S[1] / half, S[2] / half**2
@@ -274,7 +283,8 @@ def _explained(A, b, prior_2, prior_3, factor):
 def _free_parameters(factor, prior_2, prior_3):
     """Return the effective number of parameters that the data determine: 4 - tr((A + L)^-1 L).
 
-    Only the last two have a prior: of the inverse, the lower right corner is needed.
+    `factor` (4, 4) and the priors are those of `_explained`. Only the last two parameters have a
+    prior: of the inverse, the lower right corner is needed.
     """
     last = 1.0 / factor[3, 3] ** 2
     corner = (1.0 + factor[3, 2] ** 2 * last) / factor[2, 2] ** 2
@@ -283,7 +293,12 @@ def _free_parameters(factor, prior_2, prior_3):
 
 @kernel
 def _plane_between(tail, head, i, j, first, last):
-    """Return the plane halfway between two fragments, and the rate [rad/s] between them."""
+    """Return the plane halfway between two fragments, and the rate [rad/s] between them.
+
+    i is a row of `tail`, the `_Ends` of the fragments' last parts, j of `head`, those of their
+    first parts. `first` and `last` (g,) [s] are the times of each fragment's first and last
+    detection.
+    """
     drift, middle = np.empty(3), np.empty(3)
     norm, rate = 0.0, 0.0
     for a in range(3):
@@ -315,7 +330,11 @@ def _plane_between(tail, head, i, j, first, last):
 
 @kernel
 def _compare(tail, head, i, j, first, last, scratch):
-    """Return (D, degrees of freedom, ln likelihood ratio without the prior volume)."""
+    """Return (D, degrees of freedom, ln likelihood ratio without the prior volume).
+
+    D is the rise of chi-square from one motion for each fragment to one for both. Arguments as in
+    `_plane_between`; `scratch` is a `_FitScratch`.
+    """
     A_1, b_1, A_2, b_2, factor = scratch.A_1, scratch.b_1, scratch.A_2, scratch.b_2, scratch.factor
     plane, rate = _plane_between(tail, head, i, j, first, last)
     scale, extra_2 = plane.scale, max(tail.extra[i], head.extra[j])
@@ -346,7 +365,11 @@ def _compare(tail, head, i, j, first, last, scratch):
 
 @kernel
 def _near(tail, head, i, j):
-    """Return whether straight lines from both ends come within `SEARCH_SIGMA` in mid-gap."""
+    """Return whether straight lines from both ends come within `SEARCH_SIGMA` in mid-gap.
+
+    i is a row of `tail`, the `_Ends` of the fragments' last parts, j of `head`, those of their
+    first parts.
+    """
     gap = head.at[j] - tail.at[i]
     half, distance2, arc, rate = 0.5 * gap, 0.0, 0.0, 0.0
     for a in range(3):
@@ -361,7 +384,10 @@ def _near(tail, head, i, j):
 
 @kernel
 def _search(tail, head, by_start, gap_s):
-    """Return the pairs (earlier, later), at most `gap_s` apart, that pass the quick test."""
+    """Return the pairs (earlier, later), at most `gap_s` apart, that pass the quick test.
+
+    They are (p,) int64 each. by_start (g,) int has the fragments in order of `head.at`.
+    """
     n, capacity, count = len(head.at), 1024, 0
     first, second = np.empty(capacity, np.int64), np.empty(capacity, np.int64)
     sorted_start = head.at[by_start]
@@ -383,7 +409,11 @@ def _search(tail, head, by_start, gap_s):
 
 @kernel
 def _compare_all(tail, head, earlier, later, first, last):
-    """Return the results of `_compare` for each pair."""
+    """Return the results of `_compare` for each pair: three arrays (p,).
+
+    `earlier` and `later` (p,) int64 are the fragments of the pairs, `first` and `last` as in
+    `_compare`.
+    """
     n = len(earlier)
     D, free, log_ratio = np.empty(n), np.empty(n), np.empty(n)
     scratch = _FitScratch(

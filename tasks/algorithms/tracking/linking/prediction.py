@@ -34,7 +34,7 @@ ACCELERATION_SIGMA_RAD_S2 = 1e-3  # 1-sigma of an acceleration not yet measured
 class _EndStates(NamedTuple):
     """Filtered states at one end of each fragment.
 
-    at : (g,) float, times
+    at : (g,) float, times [s]
     x, P : (g, 3, 3), (g, 3, 3) float, as in `_filter`
     """
 
@@ -47,9 +47,9 @@ class _EndStates(NamedTuple):
 def _filter(fragments, first, last, step, q, x, P):
     """Run the constant-acceleration filter over the detections first, first + step .. last.
 
-    x (3, 3) receives value, rate and acceleration of the three components at the last one,
-    P (3, 3) the covariance that the components share. Backward, time steps are negative and
-    the process noise is -Q(T), which turns the sign of its odd terms only.
+    x (3, 3) receives value, rate and acceleration of the three components at the last one, P (3, 3)
+    the covariance that the components share; q [rad^2/s^5] is the process noise. Backward, time
+    steps are negative and the process noise is -Q(T), which turns the sign of its odd terms only.
     """
     time_s, u, sigma = fragments.time_s, fragments.u_icrs, fragments.sigma_rad
     x[:] = 0.0
@@ -84,7 +84,10 @@ def _filter(fragments, first, last, step, q, x, P):
 
 @kernel
 def _filter_all(fragments, backward, q):
-    """Return the states at the last detection of each fragment, or backward at the first."""
+    """Return the states at the last detection of each fragment, or backward at the first.
+
+    They are `_EndStates`; q [rad^2/s^5] is the process noise.
+    """
     offsets = fragments.offsets
     n = len(offsets) - 1
     states = _EndStates(np.empty(n), np.zeros((n, 3, 3)), np.zeros((n, 3, 3)))
@@ -99,7 +102,11 @@ def _filter_all(fragments, backward, q):
 
 @kernel
 def _covariance_at(P, T, q):
-    """Return the entries of the constant-velocity covariance predicted over T."""
+    """Return the entries of the constant-velocity covariance predicted over T [s].
+
+    They are of the value, of value and rate, and of the rate [rad^2, rad^2/s, rad^2/s^2]. P (3, 3)
+    is as in `_filter`; q [rad^2/s^3] is the process noise.
+    """
     noise = q if T >= 0 else -q
     p00 = P[0, 0] + 2 * T * P[0, 1] + T * T * P[1, 1] + noise * T**3 / 3
     p01 = P[0, 1] + T * P[1, 1] + noise * T**2 / 2
@@ -108,7 +115,11 @@ def _covariance_at(P, T, q):
 
 @kernel
 def _distance(x_1, P_1, t_1, x_2, P_2, t_2, interval_s, q):
-    """Return the mean over the window of the two predictions' squared Mahalanobis distance."""
+    """Return the mean over the window of the two predictions' squared Mahalanobis distance.
+
+    x_1, x_2, P_1, P_2 (3, 3) are as in `_filter`, at the times t_1 before t_2 [s]; q [rad^2/s^3] is
+    the process noise.
+    """
     speed_1, speed_2, norm = 0.0, 0.0, 0.0
     middle = np.empty(3)
     for a in range(3):
@@ -150,7 +161,10 @@ def _distance(x_1, P_1, t_1, x_2, P_2, t_2, interval_s, q):
 
 @kernel
 def _compare_all(tail, head, by_start, rule, limit):
-    """Return the pairs (earlier, later) within the limit and their test quantity."""
+    """Return the pairs (earlier, later) within the limit and their test quantity, (p,) each.
+
+    by_start (g,) int has the fragments in order of `head.at`; `tail` and `head` are `_EndStates`.
+    """
     capacity, count, q = 1024, 0, rule.noise_rad2_s3
     first, second = np.empty(capacity, np.int64), np.empty(capacity, np.int64)
     distance = np.empty(capacity)
