@@ -165,7 +165,11 @@ def unsolved(first: Indices) -> Solutions:
 @kernel
 def brightest_first(first, flux):
     """Return the rows of each frame's centroids, brightest first, NaN last; equal ones keep their
-    order (compiled)."""
+    order (compiled).
+
+    Frame k of F has the centroids first[k]:first[k + 1] of `flux` (N,), in any unit; `first` is
+    (F + 1,) int. The rows are (N,) int64.
+    """
     row = np.arange(len(flux))
     for k in range(len(first) - 1):
         if first[k + 1] - first[k] > 200:  # insertion is quadratic

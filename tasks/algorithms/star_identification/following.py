@@ -34,8 +34,8 @@ TOO_FEW, NO_MATCH, NOT_SEARCHED, TIME_LIMIT, SEARCH_LIMIT = 1, 2, 3, 4, 6
 class Memory(NamedTuple):
     """What is known of a sensor while its frames are followed; the kernels change it.
 
-    t_s, R, P : (2,), (2, 3, 3), (2, 3, 3): times, attitudes and covariances of the last two
-        identified frames, the later one last
+    t_s, R, P : (2,), (2, 3, 3), (2, 3, 3): times [s], attitudes, sensor from ICRS, and covariances
+        about the sensor axes [rad^2] of the last two identified frames, the later one last
     counters : (3,) int64: number of these frames, 0 to 2; 1 where the last prior of an identified
         frame was confirmed; number of further frames that are not searched
     near, cone : (stars,) int64 and (5,): the stars around a field; how many, the direction
@@ -65,7 +65,7 @@ def new_memory(n_stars: int) -> Memory:
 class FrameArrays(NamedTuple):
     """A sensor's frames as the kernels take them; F frames, N centroids, C cameras.
 
-    t_s : (F,) float, times
+    t_s : (F,) float, times [s]
     first, u, sigma, instrumental, beta : as in `SensorCentroids`
     camera : (F,) int64, row of the camera that took the frame
     box, half_diagonal : (C, 4), (C,) float, as in `FieldOfView`

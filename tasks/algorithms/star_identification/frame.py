@@ -355,8 +355,9 @@ def _middle(values: Array) -> float:
 def _search_and_solve(problem, reach, R_found, solution, matches):
     """Search a frame and match all its stars, in one call: each takes as long to call as to run.
 
-    Returns evidence, runner-up's evidence and work of the search, and the evidence of the
-    solution, which is written as by `solve_predicted` (compiled).
+    `reach` [rad] is from the boresight to a corner of the image. R_found (3, 3), sensor from ICRS,
+    receives the attitude of the search. Returns evidence, runner-up's evidence and work of the
+    search, and the evidence of the solution, which is written as by `solve_predicted` (compiled).
     """
     best, runner_up, work = search(problem, R_found)
     if not (best > problem.rule.min_evidence and best - runner_up > CLEAR_LEAD):

@@ -134,7 +134,7 @@ class StarBands(NamedTuple):
 
     first : (BANDS SECTORS + 1,) int32; the stars of a cell are first[cell]:first[cell + 1]
     row : (n,) int32, rows of the catalogue
-    u : (n, 3) float, directions
+    u : (n, 3) float, directions, ICRS
     """
 
     first: npt.NDArray[np.int32]

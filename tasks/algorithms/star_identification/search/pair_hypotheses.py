@@ -38,7 +38,7 @@ MAX_BETA = 1.1e-4
 class Stars(NamedTuple):
     """The catalogue.
 
-    u, magnitude : (m, 3), (m,) float, directions and magnitudes
+    u, magnitude : (m, 3), (m,) float, directions, ICRS, and magnitudes
     grid, bands : for look-ups of the star nearest to a direction, and of all stars of a field
     """
 
@@ -92,8 +92,9 @@ class Problem(NamedTuple):
 class PairScratch(NamedTuple):
     """Work space of one pair of centroids and one hypothesis.
 
-    E, F, R, P : (3, 3): frames of the pair in the image and in the sky, attitude, covariance
-    t : (n_checked, 3), the centroids in E
+    E, F, R, P : (3, 3): axes of the pair as rows, in the image (sensor frame) and in the sky
+        (ICRS); attitude, sensor from ICRS, and its covariance about the sensor axes [rad^2]
+    t : (n_checked, 3), the centroids on the axes E
     gain, fall, radius : (n_checked,); a hit at distance d adds gain - fall d^2, and stars
         within the radius are hits
     row_of : (n,), the star of each centroid, -1 none
