@@ -60,7 +60,10 @@ def propagate_states(r_km: Array, v_km_s: Array, dt_s: Array, steps: int) -> tup
 
 @kernel
 def _rates(y, out):
-    """Write the time derivatives of y to `out`, as in `advance`."""
+    """Write the time derivatives of y to `out`, as in `advance`.
+
+    y is (6,) or (42,); `out` may be longer, and its other elements stay.
+    """
     x0, x1, x2 = y[0], y[1], y[2]
     r2 = x0 * x0 + x1 * x1 + x2 * x2
     pull = GM_KM3_S2 / (r2 * np.sqrt(r2))
@@ -88,7 +91,8 @@ def advance(y, dt_s, step_s, work):
     """Propagate y by dt_s [s] in place, in equal steps of at most step_s [s].
 
     y (6,) is a state [km, km/s], GCRF; or y (42,) the state and, row by row, the (6, 6) matrix of
-    its derivatives by the state at the epoch. `work` (5, 42) is scratch.
+    its derivatives by the state at the epoch. `work` (5, 42) is scratch; (5, 6) suffices for a
+    state.
     """
     n = int(np.ceil(abs(dt_s) / step_s))
     if n == 0:

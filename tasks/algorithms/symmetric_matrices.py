@@ -36,7 +36,7 @@ def factor(N, b):
 
 @kernel
 def solve_factored(L, b):
-    """Solve L L^T x = b in place, with the factor of `factor`."""
+    """Solve L L^T x = b in place, with the lower factor L (n, n) of `factor`; b (n,) becomes x."""
     n = len(b)
     for k in range(n):
         for j in range(k):

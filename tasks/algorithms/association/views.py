@@ -141,7 +141,8 @@ def _bounded(samples: Samples) -> Flags:
 def _planes(first, order, seen, u):
     """Return each sensor's planes, (s, k, 3, 3). Their axes follow the normal between instants.
 
-    `order` sorts the tracklets by sensor.
+    `order` (t,) sorts the tracklets by sensor: those of s are ``order[first[s]:first[s + 1]]``.
+    `seen` (t, k) and `u` (t, k, 3) are those of `Samples`.
     """
     plane = np.zeros((len(first) - 1, seen.shape[1], 3, 3))
     axis, across = np.zeros(3), np.zeros(3)

@@ -192,7 +192,7 @@ def _between(before, after, share):
 
 @inlined_kernel
 def _cube(x, y, z):
-    """Return the number of the cube of a point; `N_CUBES` ** 3 outside of all."""
+    """Return the number of the cube of a point [km, GCRF]; `N_CUBES` ** 3 outside of all."""
     half = N_CUBES // 2
     i, j = int(np.floor(x / CUBE_KM)) + half, int(np.floor(y / CUBE_KM)) + half
     k = int(np.floor(z / CUBE_KM)) + half
@@ -267,7 +267,11 @@ def _near(lines, dt_s, states, order, first, reach_km):
 
 @borrowing_kernel
 def _row(first, x, y, z):
-    """Return the first and last satellite in the cube of a point and the two beside it in z."""
+    """Return where the satellites in the cube of a point and the two beside it in z begin and end.
+
+    They are rows of the sorted states of `_cubes`, the end not included; `first` (cubes + 2,) is of
+    `_cubes` too. x, y, z [km], GCRF.
+    """
     half = N_CUBES // 2
     i, j = int(np.floor(x / CUBE_KM)) + half, int(np.floor(y / CUBE_KM)) + half
     k = int(np.floor(z / CUBE_KM)) + half
@@ -279,7 +283,10 @@ def _row(first, x, y, z):
 
 @borrowing_kernel
 def _point(lines, i, along_km):
-    """Return the point of a line of sight at some distance from its sensor [km], GCRF."""
+    """Return the point of a line of sight at some distance from its sensor [km], GCRF.
+
+    The line is row i of `lines` (m, 13), see `_lines`.
+    """
     return (
         lines[i, 6] + along_km * lines[i, 0],
         lines[i, 7] + along_km * lines[i, 1],
@@ -289,7 +296,10 @@ def _point(lines, i, along_km):
 
 @borrowing_kernel
 def _is_end(lines, i, x, y, z):
-    """Return whether a point of a line of sight is in the Earth, or leaves all cubes."""
+    """Return whether a point of a line of sight is in the Earth, or leaves all cubes.
+
+    The line is row i of `lines` (m, 13), see `_lines`; x, y, z [km], GCRF.
+    """
     height_km = np.sqrt(x * x + y * y + z * z)
     is_leaving = x * lines[i, 0] + y * lines[i, 1] + z * lines[i, 2] > 0
     return height_km < LOWEST_KM or (is_leaving and height_km > CUBE_KM * N_CUBES)
@@ -299,8 +309,9 @@ def _is_end(lines, i, x, y, z):
 def _is_beside(lines, i, dt, states, k, n):
     """Return whether a satellite is within `MAX_REACH_KM` and some of a line of sight.
 
-    With `n` >= 0 its distance along the line must be nearest to `n` cubes: the others are compared
-    with other points of the line.
+    The line is row i of `lines` (m, 13), see `_lines`, `dt` [s] after the instant of the states;
+    the satellite is row k of `states` (v, 6) [km, km/s], GCRF. With `n` >= 0 its distance along the
+    line must be nearest to `n` cubes: the others are compared with other points of the line.
     """
     x, y, z = (
         states[k, 0] + dt * states[k, 3] - lines[i, 6],
@@ -317,7 +328,9 @@ def _is_beside(lines, i, dt, states, k, n):
 def _fits(lines, i, dt, states, k, reach_km, satellite):
     """Return whether a satellite may be on a line of sight, and move as the tracklet does.
 
-    It may be ahead of its prediction or behind.
+    It may be ahead of its prediction or behind. The line and the satellite are those of
+    `_is_beside`; the reaches [km], along the track and at right angles, are row `satellite` of
+    `reach_km` (n, 2).
     """
     along_km, aside_km = reach_km[satellite, 0], reach_km[satellite, 1]
     ux, uy, uz = lines[i, 0], lines[i, 1], lines[i, 2]

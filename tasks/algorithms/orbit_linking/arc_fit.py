@@ -54,6 +54,7 @@ class Tracklets(NamedTuple):
 def _relative(y, tracklets, k, d, s):
     """Write the direction d (3,) and the relative velocity s (3,) [km/s] as sensor k sees them.
 
+    Of an object with the state y (6,) or longer [km, km/s], GCRF, at the time of tracklet k.
     Returns the range [km] and its rate [km/s]. Light time is included.
     """
     delay, rho, q = 0.0, 0.0, 0.0
@@ -76,8 +77,9 @@ def _relative(y, tracklets, k, d, s):
 def _compare(y, tracklets, k, gap_s, work):
     """Write the residuals of a tracklet, their derivatives by the orbit, and their weights.
 
-    To e (4,), J (4, 6) and W (4, 4) of `work`. `gap_s` is the time from the arc's epoch. Returns
-    the log determinant of the covariance; NaN if the object is behind the sensor.
+    To e (4,), J (4, 6) and W (4, 4) of `work`. y (42,) is the orbit at the tracklet's time, as in
+    `advance`. `gap_s` is the time from the arc's epoch. Returns the log determinant of the
+    covariance; NaN if the object is behind the sensor.
     """
     d, s, H = work.d, work.s, work.H
     rho, q = _relative(y, tracklets, k, d, s)
@@ -116,7 +118,10 @@ def _compare(y, tracklets, k, gap_s, work):
 
 @kernel
 def _invert(C, b, W):
-    """Write the inverse of C (4, 4) to W; return log det C. C becomes its factor."""
+    """Write the inverse of C (4, 4) to W (4, 4); return log det C. C becomes its factor.
+
+    b (4,) is scratch.
+    """
     for j in range(4):
         b[j] = 0.0
     log_det = factor(C, b)
@@ -131,7 +136,10 @@ def _invert(C, b, W):
 
 @kernel
 def _pull_derivatives(x, component, pulls, D):
-    """Write the prior's pulls (2,) and their derivatives D (2, 6); return its log density."""
+    """Write the prior's pulls (2,) and their derivatives D (2, 6); return its log density.
+
+    x (6,) [km, km/s], GCRF, is the state, and `component` one of the population.
+    """
     log = prior_of(x, component, pulls)
     shifted = np.empty(2)
     for m in range(6):
@@ -146,7 +154,23 @@ def _pull_derivatives(x, component, pulls, D):
 
 
 class FitWork(NamedTuple):
-    """Scratch of the fit, so that it makes no arrays."""
+    """Scratch of the fit, so that it makes no arrays. Residuals are as in `Tracklets.cov`.
+
+    y, steps : (42,), (5, 42) float
+        State and its derivatives by the orbit, and scratch of `advance`.
+    N, rhs, gradient : (6, 6), (6,), (6,) float
+        Normal equations, lower half, and a copy of their right-hand side.
+    e, J, W, C : (4,), (4, 6), (4, 4), (4, 4) float
+        Residuals of a tracklet, derivatives by the orbit, weights and covariance.
+    H : (4, 6) float
+        Derivatives of the residuals by the state at the time of the tracklet.
+    b, d, s : (4,), (3,), (3,) float
+        Scratch of `_invert`, and what `_relative` writes.
+    D, pulls : (2, 6), (2,) float
+        Derivatives of the prior's pulls by the orbit, and the pulls.
+    states : (3, 6) float
+        Orbits that `fit_arc` compares.
+    """
 
     y: Array
     steps: Array
@@ -178,10 +202,11 @@ def fit_work():
 
 @kernel
 def _add_tracklets(tracklets, members, epoch_s, state, work):
-    """Write the normal equations of all members to N and rhs of `work`.
+    """Write the normal equations of all members to N (6, 6), lower half, and rhs (6,) of `work`.
 
-    Returns their chi-square and the sum of the log determinants of their covariances, NaN if the
-    object is behind a sensor.
+    `members` (m,) are rows of `tracklets`, in order of time, and `state` (6,) [km, km/s], GCRF, is
+    the orbit at `epoch_s`. Returns their chi-square and the sum of the log determinants of their
+    covariances, NaN if the object is behind a sensor.
     """
     y, middle = work.y, 0
     for m in range(6):
@@ -211,7 +236,10 @@ def _add_tracklets(tracklets, members, epoch_s, state, work):
 
 @kernel
 def _add_one(work):
-    """Add the residuals of a tracklet to the normal equations; return their chi-square."""
+    """Add the residuals of a tracklet to the normal equations; return their chi-square.
+
+    By e (4,), J (4, 6) and W (4, 4) of `work`, to its N (6, 6), lower half, and rhs (6,).
+    """
     e, J, W, chi2 = work.e, work.J, work.W, 0.0
     for i in range(4):
         for j in range(4):
@@ -229,7 +257,10 @@ def _add_one(work):
 
 @kernel
 def _add_prior(state, component, work):
-    """Add a component of the population; return the log of its density and its chi-square."""
+    """Add a component of the population; return the log of its density and its chi-square.
+
+    To N (6, 6), lower half, and rhs (6,) of `work`, for a `state` (6,) [km, km/s], GCRF.
+    """
     log, chi2 = _pull_derivatives(state, component, work.pulls, work.D), 0.0
     for i in range(2):
         chi2 += work.pulls[i] * work.pulls[i]
@@ -286,7 +317,7 @@ def fit_component(tracklets, members, epoch_s, component, state, work):
 
 @kernel
 def sort_rows(values):
-    """Sort a few integers in place."""
+    """Sort a few integers, `values` (m,), in place."""
     for k in range(1, len(values)):
         value, at = values[k], k
         while at > 0 and values[at - 1] > value:
@@ -299,7 +330,9 @@ def sort_rows(values):
 def fit_arc(tracklets, members, epoch_s, state, work):
     """Fit one orbit; return its log evidence over all components, and chi-square of the likeliest.
 
-    `state` (6,) becomes the orbit of the likelier component. NaN if no fit converges.
+    `members` (m,) are rows of `tracklets`, in order of time. `state` (6,) [km, km/s], GCRF, at
+    `epoch_s` is where the fit begins; it becomes the orbit of the likelier component. NaN if no fit
+    converges.
     """
     best, chi2_best, total = -np.inf, np.nan, -np.inf
     start, trial, kept = work.states[0], work.states[1], work.states[2]

@@ -8,8 +8,10 @@ two, are the difference of the log evidences.
 2. Short tracklets say little in pairs, and enough by three or more: single tracklets join loosely.
 3. Of loosely joined sets those stay that all others of the set support (`_confirm`).
 4. What was released may join again, by the rule of step 1.
-5. Sets that begin up to hours after another's end are compared with the orbit of that one, and so
-   are single tracklets hours before or after a set. They join by the same rule (`_far_edges`).
+5. So may sets and single tracklets hours before or after a set, by its orbit (`_far_edges`).
+
+Kernels share n `tracklets`, `alone` (n,), the log evidence of each by itself, and the orbit of each
+set in the row of its root: `epoch_s` (n,) [s] and `states` (n, 6) [km, km/s], GCRF.
 """
 
 from typing import NamedTuple
@@ -129,6 +131,8 @@ def link_tracklets(
 ) -> LinkedTracklets:
     """Return which tracklets are one object.
 
+    Forces: two bodies and J2. What they neglect is noise that grows with time (`arc_fit`).
+
     Parameters
     ----------
     tracklets
@@ -140,12 +144,7 @@ def link_tracklets(
     log_odds
         Minimum log odds of a join, also against any that contradicts it.
     max_orbit_gap_s
-        Longest time between a set of several tracklets and another set, or a single tracklet, that
-        are compared [s].
-
-    Notes
-    -----
-    Forces: two bodies and J2. What they neglect is noise that grows with time (`arc_fit`).
+        Longest time between a set of several tracklets and a set or tracklet compared with it [s].
     """
     n, known = len(known), np.array(known, np.int64)
     alone = log_attributable_density(tracklets.r_km, tracklets.v_km_s, tracklets.u, tracklets.w)
@@ -236,7 +235,7 @@ def _between(
 
 @kernel
 def _fit_ends(tracklets, alone, sets, roots, epoch_s, states, heads, tails):
-    """Write the orbits of sets by their first and by their last members; NaN where none fits."""
+    """Write orbits of `roots` (s,) by first members to `heads`, by last to `tails`, if one fits."""
     work, rows = fit_work(), np.empty(MAX_MEMBERS, np.int64)
     for s in range(len(roots)):
         root = roots[s]
@@ -266,7 +265,7 @@ def _fit_ends(tracklets, alone, sets, roots, epoch_s, states, heads, tails):
 def _score_sets(tracklets, alone, sets, rows, epoch_s, states, reach_s, odds):
     """Write the log odds that the sets of two rows are one object; -inf where they cannot be.
 
-    Their orbits at `epoch_s` become the joint ones.
+    Arrays as in `Edges`, of p pairs, `rows` (p, 2). Writes `odds`; `states` become joint orbits.
     """
     work = fit_work()
     for p in range(len(rows)):
@@ -285,7 +284,10 @@ def _score_sets(tracklets, alone, sets, rows, epoch_s, states, reach_s, odds):
 
 @kernel
 def _score(tracklets, alone, pairs, odds, epoch_s, states):
-    """Write the log odds of pairs, and move their orbits to the middle; NaN becomes -inf."""
+    """Write the `odds` (p,) of pairs (p, 2), NaN as -inf, and their orbits in the middle of both.
+
+    `states` (p, 6) are at the earlier epoch before, then at `epoch_s` (p,), which is written too.
+    """
     work = fit_work()
     for p in range(len(pairs)):
         i, j = pairs[p, 0], pairs[p, 1]
@@ -352,7 +354,7 @@ def _begin_known(tracklets, alone, sets, epoch_s, states):
 def _nearest(tracklets, sets, root, at_s, reach_s, but, out):
     """Write at most MAX_MEMBERS members of a set that are nearest in time; return their number.
 
-    They are within reach_s; in order of distance in time. Member `but` is left out.
+    To `out` (MAX_MEMBERS,), nearest to at_s first, within reach_s. Member `but` is left out.
     """
     count = 0
     k = root
@@ -393,7 +395,7 @@ def _compatible(tracklets, sets, a, b):
 def _sum(tracklets, alone, members, start_s, start, work):
     """Return log evidence, chi-square and degrees of freedom of a set, and its epoch and orbit.
 
-    The evidence is NaN if no orbit converges.
+    `members` (m,) are sorted by time here. NaN: no orbit converges from `start` (6,) at `start_s`.
     """
     state = start.copy()
     if len(members) == 1:
@@ -409,7 +411,7 @@ def _sum(tracklets, alone, members, start_s, start, work):
 
 @kernel
 def _gain(tracklets, alone, a, b, start_s, start, work):
-    """Return the log odds that the members a and b are one object, with their epoch and orbit.
+    """Return the log odds that members a (i,) and b (j,) are one object, their epoch and orbit.
 
     -inf where one orbit does not fit both, NaN where a or b alone is not one object.
     """
@@ -437,7 +439,7 @@ def _gain(tracklets, alone, a, b, start_s, start, work):
 
 @kernel
 def _odds(tracklets, alone, sets, a, b, at_s, reach_s, start_s, start, work):
-    """Return the log odds that two sets are one object, by their members near a time."""
+    """Return `_gain` of the sets a and b, by their members within `reach_s` of `at_s` [s]."""
     rows_a, rows_b = np.empty(MAX_MEMBERS, np.int64), np.empty(MAX_MEMBERS, np.int64)
     n_a = _nearest(tracklets, sets, a, at_s, reach_s, NONE, rows_a)
     n_b = _nearest(tracklets, sets, b, at_s, reach_s, NONE, rows_b)
@@ -492,7 +494,7 @@ def _support(tracklets, alone, sets, root, k, start_s, start, work):
 def _weakest(tracklets, alone, stays, sets, root, log_odds, epoch_s, states, work):
     """Return the member of a set that the others support least, NONE if each has the log odds.
 
-    Members that are flagged in `stays` are not asked.
+    Members that are flagged in `stays` (n,) are not asked.
     """
     weakest, lowest = NONE, log_odds
     k = root
@@ -556,7 +558,7 @@ def _confirm(tracklets, alone, stays, log_odds, sets, is_loose, epoch_s, states)
 def _join_all(tracklets, alone, edges, log_odds, loosely, sets, is_loose, epoch_s, states):
     """Join sets, best pairs first, until nothing changes; write the orbit of each join.
 
-    `loosely` joins single tracklets only, and marks the sets in `is_loose`.
+    `loosely` joins single tracklets only, and marks the sets in `is_loose` (n,), by their roots.
     """
     work = fit_work()
     tried = np.full(len(edges.odds), NONE)  # size of both sets at the last attempt

@@ -80,7 +80,10 @@ def _off_circle(across2, along0, slope, radius):
 
 @borrowing_kernel
 def _may_move_at(tracklets, k, low, high, x, v):
-    """Return whether tracklet k may be nearly circular between two distances from the geocentre."""
+    """Return whether tracklet k may be nearly circular between two distances from the geocentre.
+
+    These are `low` and `high` [km]; x (3,) and v (3,) are scratch.
+    """
     r, u, w = tracklets.r_km[k], tracklets.u[k], tracklets.w[k]
     radius, up = 0.5 * (low + high), dot(r, u)
     nearest2 = dot(r, r) - up * up  # square of the line's least distance
@@ -108,7 +111,10 @@ def _may_move_at(tracklets, k, low, high, x, v):
 
 @kernel
 def at_heights(tracklets, edges, out):
-    """Write to `out` (h, n), bool, which tracklets may be nearly circular at each height."""
+    """Write to `out` (h, n), bool, which tracklets may be nearly circular at each height.
+
+    `edges` (h + 1,) are the edges of the heights: distances from the geocentre [km].
+    """
     x, v = np.empty(3), np.empty(3)
     for h in range(len(out)):
         for k in range(out.shape[1]):
@@ -146,7 +152,11 @@ def _predict(tracklets, i, j, a, q, dt, off, out):
 
 @borrowing_kernel
 def _oblate(tracklets, i, j, a, q, dt, there, off, y, steps):
-    """Write to `off` (2, 3) what J2 adds to the motion, over two bodies' in `there` (10,)."""
+    """Write to `off` (2, 3) what J2 adds to the motion, over two bodies' in `there` (10,).
+
+    Position [km] and velocity [km/s], GCRF, `dt` [s] after the epoch of tracklet i; `there` is
+    `out` of `_predict`. y (6,) and `steps` (5, 42) are scratch.
+    """
     for m in range(3):
         y[m] = tracklets.r_km[i, m] + a * tracklets.u[i, m]
         y[3 + m] = tracklets.v_km_s[i, m] + a * tracklets.w[i, m] + q * tracklets.u[i, m]
@@ -191,7 +201,8 @@ def _step(tracklets, i, j, a, b, g, gdot, model_km, model_km_s, predicted):
 def _refine(tracklets, i, j, a, q, n, work):
     """Refine range [km] and range rate [km/s] at tracklet i; return them, and chi-square.
 
-    inf where no orbit leads to tracklet j. n: mean motion [rad/s].
+    inf where no orbit leads to tracklet j. n: mean motion [rad/s]. `work`: scratch (3, 10), (2, 3),
+    (6,) and (5, 42), as `predicted`, `off`, `y` and `steps`.
     """
     dt = tracklets.time_s[j] - tracklets.time_s[i]
     predicted, off, y, steps = work
@@ -218,8 +229,9 @@ def _refine(tracklets, i, j, a, q, n, work):
 def _pair_at(tracklets, p, q, i, j, radius, n, state, work):
     """Find the orbit of two tracklets about a circular one; write it at i's epoch to `state` (6,).
 
-    p, q: their rows of `packed_tracklets`; n: mean motion at the radius. Returns chi-square of 2
-    degrees of freedom, inf where no bound orbit in space is near.
+    The state is in the GCRF [km, km/s]. p (26,), q (26,): their rows of `packed_tracklets`; n: mean
+    motion [rad/s] at the `radius` [km]; `work` of `_refine`. Returns chi-square of 2 degrees of
+    freedom, inf where no bound orbit in space is near.
     """
     dt = tracklets.time_s[j] - tracklets.time_s[i]
     f, g = np.cos(n * dt), np.sin(n * dt) / n

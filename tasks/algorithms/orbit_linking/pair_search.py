@@ -160,10 +160,11 @@ def _ranges(tracklets, i, j, arc, a, b, model_km, oblate):
 def join_pair(tracklets, i, j, first_km, state, work):
     """Find the orbit through two attributables; write it at i's epoch to `state` (6,).
 
-    The first solution is about a circular orbit at the distance `first_km` from the geocentre.
+    The state is in the GCRF [km, km/s]. The first solution is about a circular orbit at the
+    distance `first_km` from the geocentre.
 
-    Returns chi-square of 2 degrees of freedom, inf where no orbit in space is near.
-    `work` (8, 3) is scratch.
+    Returns chi-square of 2 degrees of freedom, inf where no orbit in space is near. `work` (8, 3)
+    is scratch.
     """
     dt = tracklets.time_s[j] - tracklets.time_s[i]
     ri, rj, v, oblate = work[0], work[1], work[2], work[3]
@@ -205,7 +206,10 @@ def join_pair(tracklets, i, j, first_km, state, work):
 
 @borrowing_kernel
 def _oblateness(ri, rj, out):
-    """Write the acceleration by the oblateness between two positions; return its scale [km/s^2]."""
+    """Write the acceleration by the oblateness between two positions; return its scale [km/s^2].
+
+    ri (3,), rj (3,): the positions [km]; `out` (3,): the acceleration [km/s^2], GCRF.
+    """
     r2 = dot(ri, ri)
     scale = 1.5 * J2 * EARTH_RADIUS_KM**2 * GM_KM3_S2 / (r2 * r2)
     z = 0.5 * (ri[2] + rj[2])
@@ -219,7 +223,7 @@ def _oblateness(ri, rj, out):
 def _velocity(tracklets, i, j, a, b, v, N, right):
     """Write the velocity that fits the rates of both directions, for epochs that are the same.
 
-    N (3, 3) and right (3,) are scratch.
+    v (3,): the velocity [km/s], GCRF; a, b: the ranges [km]. N (3, 3) and right (3,) are scratch.
     """
     for m in range(3):
         right[m] = 0.0
@@ -292,8 +296,9 @@ def _dot_at(a, m, b, n):
 def first_ranges(p, q, f, g, model_km):
     """Return the ranges [km] of the first solution of two rows of `packed_tracklets`, chi-square.
 
-    The equations are those of `_ranges`, without oblateness. All pairs are tested, so both axes
-    share one weight: that of their mean variance. model_km: 1-sigma error of Lagrange's f and g.
+    p (26,), q (26,): the rows; f and g [s]: Lagrange's; model_km: 1-sigma error of these. The
+    equations are those of `_ranges`, without oblateness. All pairs are tested, so both axes share
+    one weight: that of their mean variance.
     """
     square = FIRST_RANGE_KM * FIRST_RANGE_KM
     common = p[_POSITION_VAR] + q[_POSITION_VAR] + model_km * model_km
@@ -312,7 +317,10 @@ def first_ranges(p, q, f, g, model_km):
 
 @borrowing_kernel
 def _first_chi2(p, q, dt, f, g):
-    """Return chi-square of the first solution of `join_pair`; inf where a range is not positive."""
+    """Return chi-square of the first solution of `join_pair`; inf where a range is not positive.
+
+    p (26,), q (26,): rows of `packed_tracklets`; dt [s]: the time between; f and g [s]: Lagrange's.
+    """
     fall = GRAVITY_SHARE * 0.5 * GM_KM3_S2 / _dot_at(p, _R, p, _R) * dt * dt
     a, b, chi2 = first_ranges(p, q, f, g, fall)
     return chi2 if a > 0.0 and b > 0.0 else np.inf
@@ -320,7 +328,10 @@ def _first_chi2(p, q, dt, f, g):
 
 @borrowing_kernel
 def _on_one_satellite(p, q, dt, f, g):
-    """Return whether the sensors of two tracklets move on one orbit."""
+    """Return whether the sensors of two tracklets move on one orbit.
+
+    Arguments as in `_first_chi2`.
+    """
     off = 0.0
     for m in range(3):
         off += (f * p[_R + m] + g * p[_V + m] - q[_R + m]) ** 2
@@ -377,7 +388,10 @@ def search(tracklets, packed, group, max_gap_s, first, last, pairs, states, stat
 
 @borrowing_kernel
 def add_pair(i, j, state, count, pairs, states):
-    """Write a pair and its orbit as number `count`, where there is room; return the next number."""
+    """Write a pair and its orbit as number `count`, where there is room; return the next number.
+
+    `pairs` (m, 2) and `states` (m, 6) have room for m; `state` (6,) is the orbit [km, km/s], GCRF.
+    """
     if count < len(pairs):
         pairs[count, 0], pairs[count, 1] = i, j
         for m in range(6):
@@ -387,7 +401,10 @@ def add_pair(i, j, state, count, pairs, states):
 
 @borrowing_kernel
 def _too_far(p, q, dt):
-    """Return whether no bound object can be near both lines of sight."""
+    """Return whether no bound object can be near both lines of sight, `dt` [s] apart.
+
+    p (26,), q (26,): rows of `packed_tracklets`.
+    """
     apart2 = 0.0
     for m in range(3):
         apart2 += (q[_R + m] - p[_R + m]) ** 2
@@ -397,7 +414,10 @@ def _too_far(p, q, dt):
 
 @borrowing_kernel
 def _start_km(p, rho):
-    """Return the distance from the geocentre of a point on a line of sight, above the ground."""
+    """Return the distance from the geocentre of a point on a line of sight, above the ground [km].
+
+    p (26,): row of `packed_tracklets`; rho: range of the point [km].
+    """
     r2 = _dot_at(p, _R, p, _R) + 2.0 * rho * _dot_at(p, _R, p, _U) + rho * rho
     return max(np.sqrt(r2), EARTH_RADIUS_KM + MIN_HEIGHT_KM)
 

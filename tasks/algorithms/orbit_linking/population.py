@@ -99,7 +99,10 @@ def _of_velocities(x, v_across, u):
 
 @kernel
 def _log_rates(r_km, v_km_s, u, w, out):
-    """Write the log density of the attributables that the population shows."""
+    """Write the log density of the attributables that the population shows, to `out` (n,).
+
+    The other arguments (n, 3), and the unit of the density, as in `log_attributable_density`.
+    """
     x, v_across = np.empty(3), np.empty(3)
     step = np.log(MAX_RANGE_KM / MIN_RANGE_KM) / N_RANGES
     for k in range(len(out)):

@@ -103,7 +103,10 @@ def surroundings(
 
 @kernel
 def _at_time(nodes, start_s, step_s, t_s, out):
-    """Write the position of a body at a time to `out` (3,): a cubic between its nodes."""
+    """Write the position [km] of a body at a time to `out` (3,): a cubic between its nodes.
+
+    `nodes` (m, 6) are `sun` or `moon` of `Surroundings`, with `start_s` and `step_s` of it.
+    """
     k = min(max(int((t_s - start_s) / step_s), 0), len(nodes) - 2)
     u = (t_s - start_s) / step_s - k
     for a in range(3):
@@ -120,6 +123,9 @@ def _at_time(nodes, start_s, step_s, t_s, out):
 @kernel
 def _add_earth(x, angle_rad, out):
     """Add the Earth's gravity at `x` to `out`: point mass, J2 to J4, C22 and S22.
+
+    `x` (3,) [km] and `out` (3,) [km/s^2] are in the axes of the night, `angle_rad` is the Earth
+    rotation angle.
 
     References
     ----------
@@ -151,8 +157,11 @@ def _add_earth(x, angle_rad, out):
 
 @kernel
 def gravity_gradient(x, out):
-    """Write the derivatives of point mass and J2 at `x` to `out` (3, 3): those of the others are
-    below 1e-5 of them."""
+    """Write the derivatives [1/s^2] of the gravity of point mass and J2 at `x` to `out` (3, 3).
+
+    `x` (3,) [km] is in the axes of the night. The derivatives of the others are below 1e-5 of
+    these.
+    """
     z2 = x[2] * x[2]
     r2 = x[0] * x[0] + x[1] * x[1] + z2
     r3 = r2 * np.sqrt(r2)
@@ -170,7 +179,11 @@ def gravity_gradient(x, out):
 
 @kernel
 def _add_body(x, body, gm, out):
-    """Add the pull of a body at `body` on a satellite at `x`, less its pull on the Earth."""
+    """Add the pull of a body at `body` on a satellite at `x`, less its pull on the Earth.
+
+    `x` and `body` (3,) [km] are geocentric, in the axes of the night; `gm` [km^3/s^2] is of the
+    body; the pull is added to `out` (3,) [km/s^2].
+    """
     near, far = 0.0, 0.0
     for a in range(3):
         near += (body[a] - x[a]) ** 2
@@ -182,7 +195,11 @@ def _add_body(x, body, gm, out):
 
 @kernel
 def _sunlight(x, sun, out):
-    """Write the acceleration [km/s^2] of 1 m^2/kg in sunlight to `out`; 0 in the Earth's shadow."""
+    """Write the acceleration [km/s^2] of 1 m^2/kg in sunlight to `out`; 0 in the Earth's shadow.
+
+    `x` and `sun` (3,) are geocentric positions [km] of satellite and Sun in the axes of the night,
+    as those of `out` (3,).
+    """
     away, along, far2 = 0.0, 0.0, 0.0
     for a in range(3):
         away += (x[a] - sun[a]) ** 2
@@ -197,7 +214,10 @@ def _sunlight(x, sun, out):
 
 @kernel
 def _air(x, v, out):
-    """Write the acceleration [km/s^2] of 1 m^2/kg (drag coefficient included) by air to `out`."""
+    """Write the acceleration [km/s^2] of 1 m^2/kg (drag coefficient included) by air to `out`.
+
+    `x` (3,) [km], `v` (3,) [km/s] and `out` (3,) are in the axes of the night.
+    """
     r = np.sqrt(x[0] ** 2 + x[1] ** 2 + x[2] ** 2)
     height = r - EARTH_RADIUS_KM * (1.0 - OBLATENESS * (x[2] / r) ** 2)
     layer = 0

@@ -47,7 +47,10 @@ class Trajectory(NamedTuple):
 
 @kernel
 def _rates(t_s, y, areas, around, work, gradient, out):
-    """Write the time derivatives of a state and its derivatives, `y` (54,), to `out`."""
+    """Write the time derivatives of a state and its derivatives, `y` (54,), to `out` (54,).
+
+    `areas`, `around` and `work` as in `accelerate`; `gradient` (3, 3) is scratch.
+    """
     accelerate(t_s, y[:3], y[3:6], areas, around, work, out[3:6])
     gravity_gradient(y[:3], gradient)
     out[:3] = y[3:6]
@@ -62,7 +65,11 @@ def _rates(t_s, y, areas, around, work, gradient, out):
 
 @kernel
 def _integrate(values, rates, epoch, start_s, step_s, areas, around):
-    """Fill the nodes of a trajectory from that of the epoch on, in both directions."""
+    """Fill the nodes of a trajectory from that of the epoch on, in both directions.
+
+    `values` and `rates` (n, 54) as in `Trajectory`; ``values[epoch]``, at the node of the epoch, is
+    given. `areas` (2,) [m^2/kg] and `around` as in `accelerate`.
+    """
     work, gradient = np.zeros((4, 3)), np.empty((3, 3))
     stage, y = np.empty((_STAGES, N_VALUES)), np.empty(N_VALUES)
     n = len(values)

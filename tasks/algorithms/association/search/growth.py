@@ -354,7 +354,7 @@ def _review(space, work, members, n, early):
 
 @borrowing_kernel
 def _still_fits(space, work, i):
-    """Return whether a member still adds `MIN_GAIN` log-odds, at the first shared instant."""
+    """Return whether member i still adds `MIN_GAIN` log-odds, at the first shared instant."""
     views, chance, points, part = space.views, space.chance, work.points, work.part
     for m in range(len(views.time_s)):
         if points.seen_by[m] >= 2 and views.seen[i, m]:

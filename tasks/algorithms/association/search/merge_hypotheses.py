@@ -20,10 +20,10 @@ from epipole.tasks.algorithms.kernels import kernel
 
 @kernel
 def _weigh(space, work, members, x_km):
-    """Return the log-odds of a set of tracklets as one object, as `odds.score`.
+    """Return the log-odds of a set of tracklets, `members` (n,), as one object, as `odds.score`.
 
-    -inf if they do not fit. Writes `work.missed`, and the point `x_km` (3,) at the first solved
-    instant.
+    -inf if they do not fit. Writes `work.missed`, and the point `x_km` (3,), GCRF, at the first
+    solved instant.
     """
     views, points = space.views, work.points
     points.seen_by[:] = 0

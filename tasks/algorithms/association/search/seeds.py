@@ -114,7 +114,10 @@ def _plane_angles(space, s, m, baseline, axes):
 
 @borrowing_kernel
 def _write_axes(views, a, m, baseline, axes):
-    """Write two axes across the baseline, the first (angle 0) towards the field of sensor a."""
+    """Write two axes across the baseline, the first (angle 0) towards the field of sensor a.
+
+    To `axes` (2, 3), unit vectors; `baseline` (3,) [km] and they are in the GCRF, at instant m.
+    """
     length2, along, towards2 = 0.0, 0.0, 0.0
     for q in range(3):
         length2 += baseline[q] * baseline[q]
