@@ -364,8 +364,9 @@ def residual(views, i, m, x, part):
     another range sees it there `extra_light_s` after the instant. Sensor and direction are moved to
     that time.
 
-    `part` (11,), on the sensor's plane: the residual (2), its partials (2 by 3) [1/km], and the
-    inverse covariance (xx, xy, yy). Returns the depth of the point [km], 0 behind the sensor.
+    `part` (11,) or longer, on the sensor's plane: the residual (2), its partials (2 by 3) [1/km],
+    and the inverse covariance (xx, xy, yy). Returns the depth of the point [km], 0 behind the
+    sensor.
     """
     # Element by element: numba counts references to every row that is sliced.
     cam, see, s = views.camera, views.sight, views.sensor[i]
@@ -396,7 +397,7 @@ def residual(views, i, m, x, part):
 
 @borrowing_kernel
 def residual_chi2(part):
-    """Return the chi-square of a residual that `residual` wrote to `part` (11,)."""
+    """Return the chi-square of a residual that `residual` wrote to `part`."""
     e0, e1 = part[0], part[1]
     return part[8] * e0 * e0 + 2 * part[9] * e0 * e1 + part[10] * e1 * e1
 
@@ -406,7 +407,7 @@ def error_sr(views, i, m, part):
     """Return the solid angle [sr] of the errors of a residual that `residual` wrote.
 
     It is 2 pi times the square root of the determinant of their covariance, that of the sensor's
-    position included. The residual `part` (11,) is that of tracklet i at instant m.
+    position included. The residual `part` is that of tracklet i at instant m.
     """
     flat = 1.0 + views.sight[i, m, X] ** 2 + views.sight[i, m, Y] ** 2
     return 2 * np.pi / np.sqrt((part[8] * part[10] - part[9] ** 2) * flat**3)
