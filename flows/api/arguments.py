@@ -152,6 +152,8 @@ def time_ns(time: Time) -> int:
     ValueError
         Where it is not a time.
     """
+    if isinstance(time, np.datetime64) and not np.isnat(time):
+        return int(nanoseconds("time", time))
     try:
         if isinstance(time, int | np.integer) and not isinstance(time, bool):
             return int(np.int64(int(time)))
@@ -161,9 +163,6 @@ def time_ns(time: Time) -> int:
             zone = time.tzinfo or datetime.UTC
             since = time.replace(tzinfo=zone) - datetime.datetime(1970, 1, 1, tzinfo=datetime.UTC)
             return int(np.int64((since // datetime.timedelta(microseconds=1)) * 1000))
-        if isinstance(time, np.datetime64) and not np.isnat(time):
-            return int(nanoseconds("time", time))
     except (ValueError, OverflowError) as error:
-        said = str(error).removeprefix("time: ")
-        raise ValueError(f"time: {said}") from error
+        raise ValueError(f"time: {error}") from error
     raise ValueError(f"time: {time!r} is not a time; give a datetime, or nanoseconds since 1970")

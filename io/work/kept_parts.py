@@ -18,13 +18,28 @@ KEY = "key"  # a file of a part: its key
 BATCH_ROWS = 65_536  # of a table that are digested at once: a few megabytes
 
 
-def part_key(made_from: Iterable[object], tables: Iterable[pa.Table] = ()) -> str:
-    """Return the key of a part: a digest of the texts of some values, and of the rows of tables.
+def part_key(
+    made_from: Iterable[object], tables: Iterable[pa.Table] = (), parts: Iterable[Path] = ()
+) -> str | None:
+    """Return the key of a part: a digest of what it is made from; None where this cannot be said.
 
     Equal rows give the same key, however they are divided into chunks.
+
+    Parameters
+    ----------
+    made_from
+        Values that have a text: numbers, names, spans.
+    tables
+        Rows that it is made from.
+    parts
+        Other parts that it is made from, in an order that is always the same. One of them without a
+        key leaves it without one.
     """
+    keys = [key_of(part) for part in parts]
+    if None in keys:
+        return None
     digest = hashlib.blake2b(digest_size=16)
-    for value in made_from:
+    for value in (*made_from, *keys):
         digest.update(f"{value!r}\0".encode())
     for rows in tables:
         digest.update(f"{rows.num_rows} {rows.column_names}\0".encode())
@@ -40,12 +55,6 @@ def key_of(part: Path) -> str | None:
     except (OSError, UnicodeDecodeError):
         return None
     return key if re.fullmatch("[0-9a-f]{32}", key) else None
-
-
-def one_key(parts: Iterable[Path]) -> str | None:
-    """Return one key of several parts, in this order; None where one of them has no key."""
-    keys = [key_of(part) for part in parts]
-    return None if None in keys else part_key(keys)
 
 
 def take_part(part: Path, kept: Path | None, key: str | None) -> bool:

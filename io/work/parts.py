@@ -15,7 +15,7 @@ from typing import Final, NamedTuple
 import pyarrow as pa
 import pyarrow.ipc as ipc
 
-from epipole.io.work.kept_parts import KEY, one_key, take_part
+from epipole.io.work.kept_parts import KEY, take_part
 from epipole.schemas.bridge import concat
 from epipole.schemas.errors import DatasetError
 from epipole.schemas.spans import Span, spans_between
@@ -239,9 +239,9 @@ class Parts(NamedTuple):
         """Return whether the span's part could be taken from those kept; see `take_part`."""
         return take_part(self.of(span), self.kept, key)
 
-    def keys(self, spans: Iterable[Span]) -> str | None:
-        """Return one key of the parts of these spans; None where one of them has no key."""
-        return one_key(self.of(span) for span in spans if self.holds(span))
+    def written(self, spans: Iterable[Span]) -> list[Path]:
+        """Return the parts of those spans that have one."""
+        return [self.of(span) for span in spans if self.holds(span)]
 
     def rows_within(self, span: Span, schema: pa.Schema, name: str, time: str = "time") -> pa.Table:
         """Return a table's rows whose time lies in a span, from all parts that may have some.

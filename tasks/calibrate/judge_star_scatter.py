@@ -13,6 +13,7 @@ from epipole.tasks.algorithms.log_checks.frames import check_star_scatter
 from epipole.tasks.calibrate.calibrate_sensors import SensorStars
 from epipole.tasks.common.batches import Batch
 from epipole.tasks.common.stage_tasks import stage_task
+from epipole.tasks.identify.frame_inputs import optional_values
 from epipole.tasks.read.judge_sensor import checks_table
 from epipole.tasks.read.order_frames import frames_between
 
@@ -56,13 +57,10 @@ def stated_sigmas(exposures: pa.Table, stars: pl.DataFrame) -> Array:
 
     `stars` have `frame_number` and `centroid`, the index in the lists of EXPOSURES.
     """
-    at = {number: k for k, number in enumerate(array(exposures, "frame_number").tolist())}
-    values, first = flatten(exposures, "sigma_px")
-    known = np.append(np.diff(first) > 0, False)
-    row = np.array([at.get(number, -1) for number in stars["frame_number"].to_list()], int)
-    index = first[row] + stars["centroid"].to_numpy()
-    out = np.full(len(row), np.nan)
-    has = (row >= 0) & known[row]
-    out[has] = values[index[has]]
-    out[~(out > 0)] = np.nan
+    _, first = flatten(exposures, "x_px")
+    at = dict(zip(array(exposures, "frame_number").tolist(), first.tolist(), strict=False))
+    begins = np.array([at.get(number, -1) for number in stars["frame_number"].to_list()], int)
+    has, out = begins >= 0, np.full(len(begins), np.nan)
+    centroid = stars["centroid"].to_numpy()
+    out[has] = optional_values(exposures, "sigma_px")[begins[has] + centroid[has]]
     return out

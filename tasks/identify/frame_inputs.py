@@ -63,7 +63,7 @@ def flatten_centroids(
     x_px, first = flatten(exposures, "x_px")
     y_px, _ = flatten(exposures, "y_px")
     frame = np.repeat(np.arange(exposures.num_rows), np.diff(first))
-    sigma_px = _optional(exposures, "sigma_px", len(x_px))
+    sigma_px = optional_values(exposures, "sigma_px")
     sigma_px[sigma_px < LEAST_SIGMA_PX] = np.nan
     if settings.centroid_sigma_px is not None:
         sigma_px = np.where(np.isnan(sigma_px), settings.centroid_sigma_px, sigma_px)
@@ -79,18 +79,19 @@ def flatten_centroids(
         row_s[at] = row_offset_s(camera, y_px[at])
         # In the corners of a wide lens's image, a position may have no direction.
         in_image[at] = inside(camera, x_px[at], y_px[at]) & np.isfinite(u[at, 2])
-    flux = _optional(exposures, "flux", len(x_px))
+    flux = optional_values(exposures, "flux")
     return FlatCentroids(
         first, frame, x_px, y_px, flux, sigma_px, u, pixel_rad, in_image, camera_of_frame, used,
         row_s, turn,
     )  # fmt: skip
 
 
-def _optional(exposures: pa.Table, name: str, n: int) -> Array:
-    """Return a list column as one array; NaN where a list is null or a value not positive."""
+def optional_values(exposures: pa.Table, name: str) -> Array:
+    """Return a list column as one array, a value per centroid; NaN where a list is null or a value
+    not positive."""
     _, first = flatten(exposures, "x_px")
     known, first_known = flatten(exposures, name)
-    values = np.full(n, np.nan)
+    values = np.full(first[-1], np.nan)
     values[np.repeat(np.diff(first_known) > 0, np.diff(first))] = known
     values[~(values > 0)] = np.nan
     return values

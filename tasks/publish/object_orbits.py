@@ -130,18 +130,14 @@ class ObservedObjects(NamedTuple):
         time_s, all_sensors, r_km, u, basis, weight, _ = self.views
         present, sensor = np.unique(all_sensors[rows], return_inverse=True)
         count = np.bincount(sensor)
-        sigma_km = np.sqrt(np.bincount(sensor, self.cov_shared[rows][:, 1]) / count)
-        sizes = platform_sizes(time_s[rows], sensor, r_km[rows], sigma_km)
+        direction, position = (
+            np.bincount(sensor, variance) / count for variance in self.cov_shared[rows].T
+        )
+        sizes = platform_sizes(time_s[rows], sensor, r_km[rows], np.sqrt(position))
         prior = np.zeros((len(present), 6, 6))
-        for variance, times, axes in zip(
-            self.cov_shared[rows].T,
-            (np.ones(len(present)), sizes),
-            (range(3), range(3, 6)),
-            strict=True,
-        ):
-            mean = times * np.bincount(sensor, variance) / count
-            for axis in axes:
-                prior[:, axis, axis] = 1.0 / mean
+        for axis in range(3):
+            prior[:, axis, axis] = 1.0 / direction
+            prior[:, axis + 3, axis + 3] = 1.0 / (sizes * position)
         return ObjectDirections(
             time_s[rows], sensor.astype(np.int64), r_km[rows], u[rows], basis[rows], weight[rows],
             prior,

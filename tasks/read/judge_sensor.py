@@ -173,6 +173,7 @@ def _log_frames(log: SensorLog) -> LogFrames:
     """Return the frames in order of time, each once."""
     keys = np.unique(np.stack([log.time_ns, log.number], axis=1), axis=0)
     once = np.diff(keys[:, 0], prepend=-1) > 0
+    sigma_px = _known(log.sampled, "sigma_px")
     return LogFrames(
         keys[once, 0],
         keys[once, 1],
@@ -180,15 +181,14 @@ def _log_frames(log: SensorLog) -> LogFrames:
         flatten(log.sampled, "x_px")[0],
         flatten(log.sampled, "y_px")[0],
         _known(log.sampled, "flux"),
-        _known(log.sampled, "sigma_px"),
+        sigma_px[sigma_px > 0],
         array(log.sampled, "exposure_s"),
     )
 
 
 def _known(exposures: pa.Table, name: str) -> Array:
     """Return the values of a list column that are known."""
-    values = flatten(exposures.filter(pc.is_valid(exposures[name])), name)[0]
-    return values[values > 0] if name == "sigma_px" else values
+    return flatten(exposures.filter(pc.is_valid(exposures[name])), name)[0]
 
 
 def _camera(cameras: pa.Table) -> LogCamera | None:

@@ -14,7 +14,7 @@ import polars as pl
 import pyarrow as pa
 import pyarrow.compute as pc
 
-from epipole.io.work.kept_parts import one_key, part_key
+from epipole.io.work.kept_parts import part_key
 from epipole.io.work.parts import ASSOCIATED, Parts, write_part
 from epipole.io.work.work_layout import ViewedParts
 from epipole.schemas.bridge import array, concat, empty, from_polars, table, to_polars
@@ -102,12 +102,14 @@ def associate_blocks(
     more_km
         Error that is added to the positions of all sensors, 1-sigma per axis.
     """
-    for block in blocks:
-        seeing = [sensor for sensor in sensors if viewed[sensor.number].holds(block.span)]
-        read = one_key(viewed[sensor.number].of(block.span) for sensor in seeing)
-        made_from = [Stage.SOLVE, block, seeing, left_out, more_km, read]
-        key = None if read is None else part_key(made_from)
-        if not parts.holds(block) and not parts.take(block, key):
+    missing = [block for block in blocks if not parts.holds(block)]
+    span = blocks[0].span
+    seeing = [sensor for sensor in sensors if viewed[sensor.number].holds(span)]
+    read = [viewed[sensor.number].of(span) for sensor in seeing] if missing else []
+    of_span = part_key([seeing, left_out, more_km], parts=read)
+    for block in missing:
+        key = None if of_span is None else part_key([Stage.SOLVE, block, of_span])
+        if not parts.take(block, key):
             views = [
                 sensor_views(sensor, viewed[sensor.number], block.span, more_km)
                 for sensor in seeing

@@ -201,8 +201,8 @@ def _key(
     `rows` begin with the OBJECT_MEMBERS of the objects.
     """
     numbers = sorted(pc.unique(rows[0]["sensor"]).to_pylist())
-    read = [viewed[number].keys(spans_between(*time)) for number in numbers]
-    return None if None in read else part_key([Stage.SOLVE, time, *made_from, *read], rows)
+    read = [part for n in numbers for part in viewed[n].written(spans_between(*time))]
+    return part_key([Stage.SOLVE, time, *made_from], rows, read)
 
 
 def _tables(

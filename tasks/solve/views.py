@@ -301,11 +301,10 @@ def tracklets_near(tracklets: pa.Table, wide: Span) -> pa.Table:
 
 def _key(sensor: SensorParts, span: Span, wide: Span, grid: EpochGrid, named: _Named) -> str | None:
     """Return the key of a sensor's views in a span; `wide` is the time whose rows are read."""
-    read = [part.keys(part.near(wide)) for part in (sensor.identified, sensor.tracked)]
-    if None in read:
-        return None
+    stages = (sensor.identified, sensor.tracked)
+    read = [part for stage in stages for part in stage.written(stage.near(wide))]
     names = [sensor.names.read(near, "names") for near in sensor.names.near(wide)]
-    return part_key([Stage.SOLVE, "views", span, grid, *read], [*named, *names])
+    return part_key([Stage.SOLVE, "views", span, grid], [*named, *names], read)
 
 
 def _view(

@@ -467,8 +467,8 @@ def _track_span(
     _, span, identified, parts = work
     if not parts.holds(span):
         wide = span.widened(track_margin_ns(settings))
-        read = identified.keys(identified.near(wide))
-        key = None if read is None else part_key([Stage.TRACK, span, read])
+        read = identified.written(identified.near(wide))
+        key = part_key([Stage.TRACK, span], parts=read)
         if parts.take(span, key):
             return _n_detections(parts, span)
         tracked = build_tracklets(
