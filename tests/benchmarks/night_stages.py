@@ -21,6 +21,7 @@ from epipole.schemas.spans import Sensor, Span, spans_between
 from epipole.schemas.tables import DETECTIONS
 from epipole.schemas.work_tables import HOT_SUSPECTS, OBJECT_MEMBERS, SOLUTIONS, TRACKLET_RUNS
 from epipole.tasks.algorithms.simulation.paths import state_at
+from epipole.tasks.common.sightings import cameras_of
 from epipole.tasks.identify.frame_inputs import interpolate_sensor_states
 from epipole.tasks.solve.align_epochs import align_epochs
 from epipole.tasks.solve.associate_block import associate_blocks, blocks_of
@@ -60,7 +61,7 @@ def see(log: Path, settings: Settings) -> IdentifiedLog:
         identified(
             of_sensor(read.exposures, name),
             of_sensor(places, name),
-            read.cameras,
+            cameras_of(read.cameras, name),
             catalogue,
             settings,
         )
@@ -79,7 +80,7 @@ def track(seen: IdentifiedLog, settings: Settings) -> Tracked:
         tracked(
             of_sensor(seen.solutions, name),
             of_sensor(seen.detections, name),
-            seen.cameras,
+            cameras_of(seen.cameras, name),
             settings,
         )
         for name in sensor_ids(seen.solutions)
@@ -121,8 +122,9 @@ def _view(
         solutions = of_sensor(seen.solutions, sensor.sensor_id)
         own = of_sensor(epochs, sensor.sensor_id)
         detections = of_sensor(tracked.detections, sensor.sensor_id)
+        cameras = cameras_of(seen.cameras, sensor.sensor_id)
         sighted = sight_objects(
-            solutions, detections, seen.cameras, settings.tracklets, settings.alignment.window_s
+            solutions, detections, cameras, settings.tracklets, settings.alignment.window_s
         )
         views = view_objects(
             own, sighted, settings.tracklets.max_rate_deg_s, settings.alignment.window_s
