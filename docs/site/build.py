@@ -29,7 +29,8 @@ SECTIONS = {
     "Concepts": (
         "docs/conventions.md", "docs/glossary.md", "docs/methods/identification.md",
         "docs/methods/passes.md", "docs/methods/optics.md", "docs/methods/tracking.md",
-        "docs/methods/association.md", "docs/methods/positions.md", "docs/methods/sensors.md",
+        "docs/methods/association.md", "docs/methods/positions.md", "docs/methods/orbits.md",
+        "docs/methods/linking.md", "docs/methods/names.md", "docs/methods/sensors.md",
         "docs/methods/boresight.md",
     ),
     "How good": ("docs/limits.md", "docs/damage.md", "BENCHMARKS.md"),
