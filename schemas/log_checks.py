@@ -162,7 +162,7 @@ class LogCause(StrEnum):
         "positions_in_m",
         CheckVerdict.WRONG,
         "positions are in metres: times 0.001 they fall freely",
-        "write position_km in kilometres",
+        "write position_km in kilometres, or assume the unit (`--assume`)",
     )
     INERTIAL_STATES = (
         "inertial_states",
@@ -226,13 +226,13 @@ class LogCause(StrEnum):
         "velocities_in_m_s",
         CheckVerdict.WRONG,
         "velocities are in m/s",
-        "write velocity_km_s in km/s",
+        "write velocity_km_s in km/s, or assume the unit (`--assume`)",
     )
     VELOCITIES_PER_MS = (
         "velocities_per_ms",
         CheckVerdict.WRONG,
         "velocities are a thousandth of what positions do",
-        "write velocity_km_s in km/s",
+        "write velocity_km_s in km/s, or assume the unit (`--assume`)",
     )
     VELOCITIES_INERTIAL = (
         "velocities_inertial",
@@ -302,14 +302,14 @@ class LogCause(StrEnum):
         CheckVerdict.WRONG,
         "{count:.0f} of {states:.0f} states are left out, their velocities are above 1,000 km/s or "
         "no numbers: m/s?",
-        "write velocity_km_s in km/s",
+        "write velocity_km_s in km/s, or assume the unit (`--assume`)",
     )
     POSITIONS_TOO_FAR = (
         "positions_too_far",
         CheckVerdict.WRONG,
         "{count:.0f} of {states:.0f} states are left out, their positions are beyond ten million "
         "km or no numbers: metres?",
-        "write position_km in kilometres",
+        "write position_km in kilometres, or assume the unit (`--assume`)",
     )
     POSITIONS_TOO_NEAR = (
         "positions_too_near",
@@ -505,7 +505,7 @@ class LogCause(StrEnum):
         CheckVerdict.WRONG,
         "{percent:.0f} % of the views meet those of other sensors, {share_percent:.0f} % with "
         "times of frames {offset_s:+.0f} s against those of states taken back (odds 10^{odds:.0f})",
-        "write UTC in both",
+        "write UTC in both, or assume `frames_ahead_s` (`--assume`)",
     )
     EARTH_FIXED_TIMES = (
         "earth_fixed_times",
@@ -547,14 +547,14 @@ class LogCause(StrEnum):
         CheckVerdict.WRONG,
         "times of frames are {offset_s:+.3f} s (sigma {sigma_s:.3f} s) from those of states, by "
         "lines of sight: exposures last {exposure_s:.3g} s, so these are their starts",
-        "write the middle of the exposure",
+        "write the middle of the exposure, or assume `frame_time` (`--assume`)",
     )
     EXPOSURE_END = (
         "exposure_end",
         CheckVerdict.WRONG,
         "times of frames are {offset_s:+.3f} s (sigma {sigma_s:.3f} s) from those of states, by "
         "lines of sight: exposures last {exposure_s:.3g} s, so these are their ends",
-        "write the middle of the exposure",
+        "write the middle of the exposure, or assume `frame_time` (`--assume`)",
     )
     TIMES_NOT_UTC = (
         "times_not_utc",

@@ -62,12 +62,25 @@ class Assumption(Group):
         description="By how much these times are ahead of their time scale, such as 3600 for "
         "local time.",
     )
+    frames_ahead_s: float = Field(
+        0.0,
+        ge=-DAY_S,
+        le=DAY_S,
+        description="By how much times of its frames are ahead of those of its states, besides.",
+    )
+    frame_time: Literal["middle", "start", "end"] = Field(
+        "middle", description="Which instant of the exposure a frame's time is."
+    )
     states: Literal["as stated", "GCRF", "EME2000", "TEME", "ITRF"] = Field(
         "as stated", description="Reference frame of its states."
     )
     velocities: Literal["as stated", "unknown"] = Field(
         "as stated", description="Unknown: they come from its positions."
     )
+    position_unit: Literal["km", "m"] = Field(
+        "km", description="Unit of its positions and of their sigmas."
+    )
+    velocity_unit: Literal["km/s", "m/s"] = Field("km/s", description="Unit of its velocities.")
     line_time_s: float | None = Field(
         None,
         ge=LINE_TIME.minimum,
@@ -119,8 +132,10 @@ class SensorSettings(Group):
         description="How logs are read in place of what they state, where they were written "
         'otherwise: `{ sensor = "sat1", time = "gps" }` each. `sensor` is an id, or `*` for every '
         "sensor; `time` is utc, gps or tai; `ahead_s` seconds by which these times are ahead "
-        "besides; `states` GCRF, EME2000, TEME or ITRF; `velocities` unknown. A sensor takes all "
-        "that name it.",
+        "besides, `frames_ahead_s` those of frames alone; `frame_time` the middle, start or end of "
+        "the exposure; `states` GCRF, EME2000, TEME or ITRF; `position_unit` km or m (also of the "
+        "sigma), `velocity_unit` km/s or m/s; `velocities` unknown; `line_time_s` seconds from row "
+        "to row. A sensor takes all that name it.",
     )
     expected: tuple[str, ...] | None = Field(
         None,

@@ -20,7 +20,7 @@ Assume = Annotated[
     typer.Option(
         metavar="SENSOR.NAME=VALUE",
         help="Read a sensor's log otherwise than it states: sat1.time=gps, *.states=TEME, "
-        "sat1.velocities=unknown; as the settings sensors.assume. More than once, if need be.",
+        "sat1.position_unit=m; as the settings sensors.assume. More than once, if need be.",
     ),
 ]
 AsJson = Annotated[bool, typer.Option("--json", help="Print JSON on standard output.")]

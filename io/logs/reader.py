@@ -8,7 +8,7 @@ be those of another log's frames.
 
 import logging
 import os
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from concurrent.futures import Executor, ThreadPoolExecutor
 
 import numpy as np
@@ -21,6 +21,7 @@ from epipole.io.logs.mcap.container import Channel
 from epipole.io.logs.mcap.records import Block, RecordWalk
 from epipole.io.logs.messages.batches import batches_of
 from epipole.io.logs.messages.cameras import CameraColumns
+from epipole.io.logs.messages.encoding import StateMessage
 from epipole.io.logs.messages.frames import FrameColumns
 from epipole.io.logs.messages.registry import kinds_of_schemas, message_encodings
 from epipole.io.logs.messages.states import StateColumns
@@ -77,17 +78,20 @@ def read_log(path: str | os.PathLike[str]) -> LogContents:
 
 
 def read_log_pieces(
-    path: str | os.PathLike[str], piece_bytes: int = PIECE_BYTES
+    path: str | os.PathLike[str],
+    piece_bytes: int = PIECE_BYTES,
+    as_meant: Callable[[StateMessage], StateMessage] | None = None,
 ) -> Iterator[LogPiece]:
     """Yield what `read_log` returns in pieces, so that a log need not fit into memory.
 
     A piece has about `piece_bytes` of frames and states, at most one chunk of the log more. Each
     message comes once, in the order of the file. There is at least one piece. The last one has
     the rejects and the source, with the log's time range: frames outside it are strays.
+    `as_meant` returns a state that was written otherwise than it should be as it was meant.
     """
     where = known_as(os.fspath(path))
     with open_mcap(where) as data, ThreadPoolExecutor(THREADS, "open chunks") as pool:
-        reading = _Reading(where, data, pool)
+        reading = _Reading(where, data, pool, as_meant)
         for block in reading.blocks():
             known = reading.in_known_encodings(block)
             for kind, chosen in _by_kind(known):
@@ -101,12 +105,15 @@ def read_log_pieces(
 class _Reading:
     """One log while it is read: the rows of its messages until they are taken."""
 
-    def __init__(self, where: str, data: LogBytes, pool: Executor) -> None:
+    def __init__(
+        self, where: str, data: LogBytes, pool: Executor,
+        as_meant: Callable[[StateMessage], StateMessage] | None,
+    ) -> None:  # fmt: skip
         self._where, self._data = where, data
         self._name = where.rstrip("/").rpartition("/")[2]
         self.rejects = RejectList(self._name)
         self._frames = FrameColumns(self.rejects)
-        self._states = StateColumns(self.rejects)
+        self._states = StateColumns(self.rejects, as_meant)
         self._cameras = CameraColumns(self.rejects)
         self.columns: dict[str, FrameColumns | StateColumns | CameraColumns] = {
             FRAME: self._frames,

@@ -1,11 +1,12 @@
 """Assume readings: what the settings say of logs that were written otherwise than they state."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 
 import numpy as np
 import pyarrow as pa
 
-from epipole.schemas.arrays import Flags, Nanoseconds
+from epipole.io.logs.messages.encoding import StateMessage
+from epipole.schemas.arrays import Array, Flags, Nanoseconds
 from epipole.schemas.bridge import array
 from epipole.schemas.settings import EVERY_SENSOR, Assumption
 from epipole.schemas.work_tables import LogPiece, LogSource
@@ -14,6 +15,7 @@ from epipole.tasks.algorithms.times import tai_minus_utc_s, utc_julian_date
 
 TAI_MINUS_GPS_S = 19.0  # since 1980: GPS times have no leap seconds
 VELOCITIES = ("vx_km_s", "vy_km_s", "vz_km_s")
+KM = {"km": 1.0, "m": 1e-3, "km/s": 1.0, "m/s": 1e-3}
 
 
 def as_assumed(piece: LogPiece, assumptions: Sequence[Assumption]) -> LogPiece:
@@ -26,11 +28,36 @@ def as_assumed(piece: LogPiece, assumptions: Sequence[Assumption]) -> LogPiece:
             _with_times(rows, assumed) for rows in (piece.exposures, piece.states, piece.cameras)
         )
         piece = piece._replace(
-            exposures=exposures,
+            exposures=_with_frame_times(exposures, assumed),
             states=_with_states(states, assumed),
             cameras=_with_line_time(cameras, assumed),
         )
     return piece
+
+
+def in_kilometres(
+    assumptions: Sequence[Assumption],
+) -> Callable[[StateMessage], StateMessage] | None:
+    """Return what reads a state in the units of its sensor's assumptions; None if all are usual.
+
+    Units are read before the bounds of positions and velocities are checked.
+    """
+    unusual = [a for a in assumptions if (a.position_unit, a.velocity_unit) != ("km", "km/s")]
+    if not unusual:
+        return None
+
+    def read(state: StateMessage) -> StateMessage:
+        for assumed in unusual:
+            if assumed.sensor in (state.sensor_id, EVERY_SENSOR):
+                of_position, of_velocity = KM[assumed.position_unit], KM[assumed.velocity_unit]
+                state = state._replace(
+                    position_km=np.asarray(state.position_km) * of_position,
+                    velocity_km_s=np.asarray(state.velocity_km_s) * of_velocity,
+                    position_sigma_km=state.position_sigma_km * of_position,
+                )
+        return state
+
+    return read
 
 
 def as_assumed_source(
@@ -45,7 +72,7 @@ def as_assumed_source(
         moved = written
         for assumed in assumptions:
             if assumed.sensor in (sensor, EVERY_SENSOR):
-                moved = moved - _ahead_ns(moved, assumed)
+                moved = moved - _ahead_ns(moved, assumed) - _in_ns(assumed.frames_ahead_s)
         ends.append(moved)
     first, last = np.array(ends[1:] or ends).T
     return source._replace(first_time_ns=int(first.min()), last_time_ns=int(last.max()))
@@ -58,7 +85,11 @@ def _ahead_ns(time_ns: Nanoseconds, assumed: Assumption) -> Nanoseconds:
         ahead_s += tai_minus_utc_s(utc_julian_date(time_ns)[0])
     if assumed.time == "gps":
         ahead_s -= TAI_MINUS_GPS_S
-    return np.round(ahead_s * SECOND_NS).astype(np.int64)
+    return _in_ns(ahead_s)
+
+
+def _in_ns(time_s: Array | float) -> Nanoseconds:
+    return np.round(np.asarray(time_s) * SECOND_NS).astype(np.int64)
 
 
 def _of_sensor(rows: pa.Table, assumed: Assumption) -> Flags:
@@ -71,6 +102,16 @@ def _with_times(rows: pa.Table, assumed: Assumption) -> pa.Table:
     time_ns = array(rows, "time")
     moved = time_ns - np.where(_of_sensor(rows, assumed), _ahead_ns(time_ns, assumed), 0)
     return _with_column(rows, "time", pa.array(moved))
+
+
+def _with_frame_times(exposures: pa.Table, assumed: Assumption) -> pa.Table:
+    """Return the exposures; `assumed` says how their times differ from those of the states."""
+    to_middle = {"start": 0.5, "middle": 0.0, "end": -0.5}[assumed.frame_time]
+    if to_middle == 0.0 and assumed.frames_ahead_s == 0.0:
+        return exposures
+    later_s = to_middle * array(exposures, "exposure_s") - assumed.frames_ahead_s
+    later_ns = np.where(_of_sensor(exposures, assumed), _in_ns(later_s), 0)
+    return _with_column(exposures, "time", pa.array(array(exposures, "time") + later_ns))
 
 
 def _with_states(states: pa.Table, assumed: Assumption) -> pa.Table:

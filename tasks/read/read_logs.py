@@ -15,7 +15,7 @@ from epipole.schemas.stages import Stage
 from epipole.schemas.work_tables import LogSource
 from epipole.tasks.common.batches import Batch
 from epipole.tasks.common.stage_tasks import stage_task
-from epipole.tasks.read.assume_readings import as_assumed, as_assumed_source
+from epipole.tasks.read.assume_readings import as_assumed, as_assumed_source, in_kilometres
 
 LOGGER = logging.getLogger(__name__)
 
@@ -76,7 +76,7 @@ def read_log_into(
     """
     n_pieces, n_cameras, source = 0, 0, None
     sensors: dict[str, SensorInLog] = {}
-    for written in read_log_pieces(path):
+    for written in read_log_pieces(path, as_meant=in_kilometres(assumptions)):
         piece = as_assumed(written, assumptions)
         write_part(
             folder.piece(number, n_pieces),

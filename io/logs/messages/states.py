@@ -1,7 +1,7 @@
 """The states of a log as LOG_STATES."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -42,9 +42,10 @@ def _new_rows(n: int) -> StateRows:
 
 @dataclass
 class StateColumns:
-    """The states of a log."""
+    """The states of a log; `as_meant` returns a message as it was meant, before it is judged."""
 
     rejects: RejectList
+    as_meant: Callable[[StateMessage], StateMessage] | None = None
     _sensors: NameCodes = field(default_factory=NameCodes)
     _rows: StateRows = field(default_factory=lambda: _new_rows(0))
     _n: int = 0
@@ -62,7 +63,8 @@ class StateColumns:
             stopped, self._n = scan_states(messages, i, sensors, frames, self._rows, self._n)
             return int(stopped)
 
-        batch.take(scan, self._judge)
+        # Only decoded messages can be read otherwise than they state.
+        batch.take(scan if self.as_meant is None else lambda i: i, self._judge)
 
     @property
     def n_bytes(self) -> int:
@@ -103,6 +105,8 @@ class StateColumns:
         """Take decoded states; invalid ones become rejects."""
         for item in received:
             state: StateMessage = item.message
+            if self.as_meant is not None:
+                state = self.as_meant(state)
             reason = fault(state.time_ns, state.sensor_id) or _state_fault(state)
             if reason is not None:
                 self._leave_out(item, reason)

@@ -6,6 +6,7 @@ import numpy as np
 import pyarrow as pa
 import pytest
 
+from epipole.io.logs.messages.encoding import StateMessage
 from epipole.io.logs.reader import read_log_pieces
 from epipole.schemas.bridge import array
 from epipole.schemas.errors import SettingsError
@@ -15,6 +16,7 @@ from epipole.tasks.read.assume_readings import (
     VELOCITIES,
     as_assumed,
     as_assumed_source,
+    in_kilometres,
     without_velocities,
 )
 
@@ -84,6 +86,56 @@ def test_frames_of_reference_and_velocities_are_those_assumed(piece):
             states[name].to_numpy()[~mine], piece.states[name].to_numpy()[~mine]
         )
     assert states.filter(pa.array(~mine)) == piece.states.filter(pa.array(~mine))
+
+
+def test_times_of_frames_alone_are_taken_back(piece):
+    late = piece._replace(exposures=ahead(piece.exposures, 18.0, SENSORS))
+    assert as_assumed(late, [Assumption(frames_ahead_s=18.0)]) == piece
+
+
+@pytest.mark.parametrize(("instant", "earlier_by"), [("start", 0.5), ("end", -0.5)])
+def test_the_middle_of_exposures_is_found_from_their_ends(piece, instant, earlier_by):
+    rows = piece.exposures
+    exposure_s = np.linspace(0.1, 1.0, rows.num_rows)
+    index = rows.schema.get_field_index("exposure_s")
+    rows = rows.set_column(index, rows.schema.field("exposure_s"), pa.array(exposure_s))
+    written = array(rows, "time") - np.round(earlier_by * exposure_s * 1e9).astype(np.int64)
+    index, field = rows.schema.get_field_index("time"), rows.schema.field("time")
+    at_ends = rows.set_column(index, field, pa.array(written).cast(field.type))
+    found = as_assumed(piece._replace(exposures=at_ends), [Assumption(frame_time=instant)])
+    assert np.abs(array(found.exposures, "time") - array(rows, "time")).max() <= 1
+
+
+def metres(state, *sensors):
+    """The state as a log in metres has it, of some sensors."""
+    if state.sensor_id not in sensors:
+        return state
+    return state._replace(
+        position_km=np.asarray(state.position_km) * 1e3,
+        velocity_km_s=np.asarray(state.velocity_km_s) * 1e3,
+        position_sigma_km=state.position_sigma_km * 1e3,
+    )
+
+
+def test_units_are_read_before_bounds_are_checked(piece):
+    # Metres a second are faster than any velocity may be: all states of sat1 would be left out.
+    assumed = in_kilometres([Assumption(sensor="sat1", position_unit="m", velocity_unit="m/s")])
+    (wrong,) = read_log_pieces(EXAMPLE, as_meant=lambda state: metres(state, "sat1"))
+    (right,) = read_log_pieces(EXAMPLE, as_meant=lambda state: assumed(metres(state, "sat1")))
+    assert "sat1" not in set(wrong.states["sensor_id"].to_pylist())
+    assert right.states.num_rows == piece.states.num_rows
+    for name in ("x_km", "vz_km_s", "position_sigma_km"):
+        np.testing.assert_allclose(array(right.states, name), array(piece.states, name), rtol=1e-14)
+    assert right.rejects == piece.rejects
+
+
+def test_units_are_those_of_the_sensor_that_is_named():
+    state = StateMessage(0, "sat2", "GCRF", (7e6, 0.0, 0.0), (), 50.0, (), 0.0)
+    one, every = Assumption(sensor="sat1", position_unit="m"), Assumption(position_unit="m")
+    assert in_kilometres([one])(state) is state
+    assert in_kilometres([every])(state).position_km.tolist() == [7000.0, 0.0, 0.0]
+    assert in_kilometres([every])(state).position_sigma_km == 0.05
+    assert in_kilometres([Assumption(time="gps")]) is None
 
 
 def test_what_nobody_assumes_stays(piece):
