@@ -6,7 +6,7 @@ from epipole.tasks.algorithms.constants import ARCSEC, SPEED_OF_LIGHT_KM_S
 from epipole.tasks.algorithms.geometry.directions import tangent_basis
 from epipole.tasks.algorithms.orbits.forces import surroundings
 from epipole.tasks.algorithms.orbits.orbit_determination import ObjectDirections
-from epipole.tasks.algorithms.orbits.trajectories import integrate, interpolate
+from epipole.tasks.algorithms.orbits.trajectories import integrate, interpolate_position
 
 NOON_NS = 1_780_142_400_000_000_000  # 2026-05-30T12:00:00Z
 AROUND = surroundings(NOON_NS, NOON_NS - 90_000 * 10**9, NOON_NS + 130_000 * 10**9)
@@ -18,9 +18,9 @@ LOW = np.array([5000.0, 4000.0, 2500.0, -4.95, 5.62, 1.3, 0.0, 0.0])
 def positions(unknowns, times_s):
     """Return the positions (n, 3) of an orbit at times [s]."""
     path = integrate(unknowns, 0.0, min(times_s.min(), 0.0), max(times_s.max(), 0.0), AROUND)
-    out, x, jacobian = np.empty((len(times_s), 3)), np.empty(3), np.empty((3, 8))
+    out, x = np.empty((len(times_s), 3)), np.empty(3)
     for k, t in enumerate(times_s):
-        interpolate(t, path, x, jacobian)
+        interpolate_position(t, path, x)
         out[k] = x
     return out
 

@@ -22,7 +22,8 @@ from epipole.tasks.algorithms.orbits.forces import N_UNKNOWNS, Surroundings
 from epipole.tasks.algorithms.orbits.shared_errors import ArcEquations, no_equations
 from epipole.tasks.algorithms.orbits.trajectories import (
     integrate,
-    interpolate,
+    interpolate_derivatives,
+    interpolate_position,
     propagate_unknowns,
 )
 
@@ -144,7 +145,7 @@ def _residual(direction, path, shared, work, e, J):
     delay, rho, used = 0.0, 0.0, 0.0
     for _ in range(3):  # light time; right to 1e-12 of the distance
         used = delay
-        interpolate(time_s - delay, path, d, jacobian)
+        interpolate_position(time_s - delay, path, d)
         rho = 0.0
         for a in range(3):
             d[a] += shared[3 + a] - r[a]
@@ -153,6 +154,7 @@ def _residual(direction, path, shared, work, e, J):
             rho += d[a] * d[a]
         rho = np.sqrt(rho)
         delay = rho / SPEED_OF_LIGHT_KM_S
+    interpolate_derivatives(time_s - used, path, jacobian)
     receding = 0.0
     for a in range(3):
         v[a] = (v[a] - d[a]) / used  # the mean velocity during the light time

@@ -183,8 +183,18 @@ def _quintic(u, h):
 
 
 @kernel
-def interpolate(t_s, path, x, jacobian):
-    """Write an orbit's position at a time, and its derivatives by the unknowns.
+def _node_before(t_s, path):
+    """Return the node before a time, and the share of the step [0 to 1] that has passed since.
+
+    `t_s` and `path` as in `interpolate_position`.
+    """
+    k = min(max(int(np.floor((t_s - path.start_s) / path.step_s)), 0), len(path.values) - 2)
+    return k, (t_s - path.start_s) / path.step_s - k
+
+
+@kernel
+def interpolate_position(t_s, path, x):
+    """Write an orbit's position at a time.
 
     Parameters
     ----------
@@ -194,27 +204,40 @@ def interpolate(t_s, path, x, jacobian):
         `Trajectory`.
     x : (3,) float, out
         Position [km]: the quintic with positions, velocities and accelerations at two nodes.
-    jacobian : (3, 8) float, out
-        The same. Angles from one satellite hardly show the distance of an object that flies
-        along: an error of 1e-5 would hide it.
     """
-    start_s, h, values, rates = path
-    k = min(max(int(np.floor((t_s - start_s) / h)), 0), len(values) - 2)
-    u = (t_s - start_s) / h - k
-    rise, v0, v1, a0, a1 = _quintic(u, h)
-    p, q, dp, dq = values[k], values[k + 1], rates[k], rates[k + 1]
+    k, u = _node_before(t_s, path)
+    rise, v0, v1, a0, a1 = _quintic(u, path.step_s)
+    p, q, dp, dq = path.values[k], path.values[k + 1], path.rates[k], path.rates[k + 1]
     for a in range(3):
         b = 3 + a  # the velocity; its rate is the acceleration
         x[a] = p[a] + (q[a] - p[a]) * rise + v0 * p[b] + v1 * q[b] + a0 * dp[b] + a1 * dq[b]
+
+
+@kernel
+def interpolate_derivatives(t_s, path, jacobian):
+    """Write the derivatives of an orbit's position at a time by the unknowns.
+
+    Parameters
+    ----------
+    t_s, path
+        As in `interpolate_position`.
+    jacobian : (3, 8) float, out
+        By the same quintic. Angles from one satellite hardly show the distance of an object that
+        flies along: an error of 1e-5 would hide it.
+    """
+    k, u = _node_before(t_s, path)
+    rise, v0, v1, a0, a1 = _quintic(u, path.step_s)
+    p, q, dp, dq = path.values[k], path.values[k + 1], path.rates[k], path.rates[k + 1]
+    for a in range(3):
         for m in range(N_UNKNOWNS):
-            i, j = 6 + N_UNKNOWNS * a + m, 6 + N_UNKNOWNS * b + m
+            i, j = 6 + N_UNKNOWNS * a + m, 6 + N_UNKNOWNS * (3 + a) + m
             jacobian[a, m] = (
                 p[i] + (q[i] - p[i]) * rise + v0 * p[j] + v1 * q[j] + a0 * dp[j] + a1 * dq[j]
             )
 
 
 def positions_at(path: Trajectory, time_s: Array) -> Array:
-    """Return an orbit's positions (n, 3) [km] at times (n,) [s], as `interpolate` does."""
+    """Return an orbit's positions (n, 3) [km] at times (n,) [s], as `interpolate_position` does."""
     h, last = path.step_s, len(path.values) - 2
     k = np.clip(np.floor((time_s - path.start_s) / h).astype(np.int64), 0, last)
     u = ((time_s - path.start_s) / h - k)[:, None]

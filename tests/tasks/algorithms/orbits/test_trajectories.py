@@ -11,7 +11,8 @@ from epipole.tasks.algorithms.orbits.reference_frames import gcrf_from_teme, ori
 from epipole.tasks.algorithms.orbits.trajectories import (
     MAX_STEPS,
     integrate,
-    interpolate,
+    interpolate_derivatives,
+    interpolate_position,
     propagate_unknowns,
 )
 
@@ -39,8 +40,8 @@ def test_orbits_agree_with_scipy_at_nodes_and_between(unknowns, to_s):
     assert np.linalg.norm(moved[:3] - state[:3]) < METRE
     assert (moved[6:] == unknowns[6:]).all()
     path = integrate(unknowns, 0.0, min(to_s, 0.0) * 1.1, max(to_s, 0.0) * 1.1, AROUND)
-    x, jacobian = np.empty(3), np.empty((3, 8))
-    interpolate(to_s, path, x, jacobian)
+    x = np.empty(3)
+    interpolate_position(to_s, path, x)
     assert np.linalg.norm(x - state[:3]) < METRE
 
 
@@ -49,8 +50,8 @@ def test_derivatives_are_those_of_whole_trajectories(unknowns):
     to_s = 6000.0
     _, transition = propagate_unknowns(unknowns, 0.0, to_s, AROUND)
     path = integrate(unknowns, 0.0, 0.0, to_s, AROUND)
-    x, jacobian = np.empty(3), np.empty((3, 8))
-    interpolate(to_s, path, x, jacobian)
+    jacobian = np.empty((3, 8))
+    interpolate_derivatives(to_s, path, jacobian)
     for k, step in enumerate([0.01] * 3 + [1e-5] * 3 + [1e-3] * 2):
         d = step * np.eye(8)[k]
         ends = [propagate_unknowns(unknowns + s * d, 0.0, to_s, AROUND)[0] for s in (1, -1)]
