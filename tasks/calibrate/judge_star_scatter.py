@@ -58,9 +58,13 @@ def stated_sigmas(exposures: pa.Table, stars: pl.DataFrame) -> Array:
     `stars` have `frame_number` and `centroid`, the index in the lists of EXPOSURES.
     """
     _, first = flatten(exposures, "x_px")
-    at = dict(zip(array(exposures, "frame_number").tolist(), first.tolist(), strict=False))
-    begins = np.array([at.get(number, -1) for number in stars["frame_number"].to_list()], int)
-    has, out = begins >= 0, np.full(len(begins), np.nan)
-    centroid = stars["centroid"].to_numpy()
-    out[has] = optional_values(exposures, "sigma_px")[begins[has] + centroid[has]]
+    logged, number = array(exposures, "frame_number"), stars["frame_number"].to_numpy()
+    out = np.full(len(number), np.nan)
+    if not len(logged):
+        return out
+    order = np.argsort(logged, kind="stable")
+    frame = order[np.maximum(np.searchsorted(logged[order], number, side="right") - 1, 0)]
+    has = logged[frame] == number
+    centroid = first[frame[has]] + stars["centroid"].to_numpy()[has]
+    out[has] = optional_values(exposures, "sigma_px")[centroid]
     return out

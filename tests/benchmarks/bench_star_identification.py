@@ -190,8 +190,9 @@ def solvers(
     return made
 
 
-def tracking_us(frames: Frames, n_frames: int) -> tuple[float, float]:
-    """Return CPU microseconds per frame of a sensor that is followed, and centroids per frame.
+def tracking_us(frames: Frames, n_frames: int) -> tuple[float, float, int]:
+    """Return CPU microseconds per frame of a sensor that is followed, centroids per frame, and the
+    number of frames that were lost: some have two stars.
 
     It turns evenly, sees 90 % of its stars to 0.2 px, and 3 false points.
     """
@@ -216,9 +217,8 @@ def tracking_us(frames: Frames, n_frames: int) -> tuple[float, float]:
         start = time.process_time()
         found, _ = identify_sequence(t_s, flat, none, ours.sky, grid, lambda: ours.pairs, matching)
         spent.append(time.process_time() - start)
-        if not found.solved.all():
-            raise RuntimeError(f"{np.sum(~found.solved)} frames were lost")
-    return 1e6 * float(np.median(spent[1:])) / n_frames, first[-1] / n_frames
+    lost = int(np.sum(~found.solved))
+    return 1e6 * float(np.median(spent[1:])) / n_frames, first[-1] / n_frames, lost
 
 
 def main() -> None:
@@ -257,8 +257,9 @@ def main() -> None:
             if given.cells:
                 print_cells(row, frames)
         if given.only in "tracking":
-            us, centroids_a_frame = tracking_us(frames, given.tracked)
-            print(f"tracking, {centroids_a_frame:.1f} centroids: {us:.1f} CPU microseconds a frame")
+            us, centroids_a_frame, lost = tracking_us(frames, given.tracked)
+            print(f"tracking, {centroids_a_frame:.1f} centroids: {us:.1f} CPU us a frame, "
+                  f"{lost} of {given.tracked:,} lost")  # fmt: skip
 
 
 def print_cells(row: Row, frames: Frames) -> None:

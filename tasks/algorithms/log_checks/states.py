@@ -260,6 +260,8 @@ def _second_path(r_km: Array) -> Flags:
         np.linalg.norm(r_km[k : n - 3 + k] - r_km[: n - 3], axis=1) for k in (1, 2, 3)
     ], axis=0)  # fmt: skip
     far = FAR_STEP * float(np.median(nearest)) + SMALLEST_JUMP_KM
+    if (np.linalg.norm(np.diff(r_km, axis=0), axis=1) <= far).all():
+        return second
     last, other = r_km[0], None
     for k in range(1, n):
         to_last = float(np.linalg.norm(r_km[k] - last))
