@@ -232,7 +232,7 @@ class LogCause(StrEnum):
         "velocities_per_ms",
         CheckVerdict.WRONG,
         "velocities are a thousandth of what positions do",
-        "write velocity_km_s in km/s, or assume the unit (`--assume`)",
+        "write velocity_km_s in km/s",
     )
     VELOCITIES_INERTIAL = (
         "velocities_inertial",
@@ -371,7 +371,7 @@ class LogCause(StrEnum):
         "frames_and_states_shifted",
         CheckVerdict.WRONG,
         "frames lie {shift_s:+.1f} s from the states, which last as long: {scale}",
-        "write UTC in both",
+        "write UTC in both, or assume `frames_ahead_s` (`--assume`)",
     )
     NO_STATE_NEAR = (
         "no_state_near",

@@ -77,9 +77,8 @@ class Assumption(Group):
     velocities: Literal["as stated", "unknown"] = Field(
         "as stated", description="Unknown: they come from its positions."
     )
-    position_unit: Literal["km", "m"] = Field(
-        "km", description="Unit of its positions and of their sigmas."
-    )
+    position_unit: Literal["km", "m"] = Field("km", description="Unit of its positions.")
+    position_sigma_unit: Literal["km", "m"] = Field("km", description="Unit of their sigmas.")
     velocity_unit: Literal["km/s", "m/s"] = Field("km/s", description="Unit of its velocities.")
     line_time_s: float | None = Field(
         None,
@@ -133,9 +132,9 @@ class SensorSettings(Group):
         'otherwise: `{ sensor = "sat1", time = "gps" }` each. `sensor` is an id, or `*` for every '
         "sensor; `time` is utc, gps or tai; `ahead_s` seconds by which these times are ahead "
         "besides, `frames_ahead_s` those of frames alone; `frame_time` the middle, start or end of "
-        "the exposure; `states` GCRF, EME2000, TEME or ITRF; `position_unit` km or m (also of the "
-        "sigma), `velocity_unit` km/s or m/s; `velocities` unknown; `line_time_s` seconds from row "
-        "to row. A sensor takes all that name it.",
+        "the exposure; `states` GCRF, EME2000, TEME or ITRF; `position_unit` and "
+        "`position_sigma_unit` km or m, `velocity_unit` km/s or m/s; `velocities` unknown; "
+        "`line_time_s` seconds from row to row. A sensor takes all that name it.",
     )
     expected: tuple[str, ...] | None = Field(
         None,

@@ -42,18 +42,21 @@ def in_kilometres(
 
     Units are read before the bounds of positions and velocities are checked.
     """
-    unusual = [a for a in assumptions if (a.position_unit, a.velocity_unit) != ("km", "km/s")]
+    scales = [
+        (each.sensor, KM[each.position_unit], KM[each.velocity_unit], KM[each.position_sigma_unit])
+        for each in assumptions
+    ]
+    unusual = [each for each in scales if each[1:] != (1.0, 1.0, 1.0)]
     if not unusual:
         return None
 
     def read(state: StateMessage) -> StateMessage:
-        for assumed in unusual:
-            if assumed.sensor in (state.sensor_id, EVERY_SENSOR):
-                of_position, of_velocity = KM[assumed.position_unit], KM[assumed.velocity_unit]
+        for sensor, of_position, of_velocity, of_sigma in unusual:
+            if sensor in (state.sensor_id, EVERY_SENSOR):
                 state = state._replace(
                     position_km=np.asarray(state.position_km) * of_position,
                     velocity_km_s=np.asarray(state.velocity_km_s) * of_velocity,
-                    position_sigma_km=state.position_sigma_km * of_position,
+                    position_sigma_km=state.position_sigma_km * of_sigma,
                 )
         return state
 

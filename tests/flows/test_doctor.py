@@ -15,6 +15,7 @@ from epipole.flows.nightly import nightly
 from epipole.io.datasets.dataset import night_reader, read_table
 from epipole.io.logs.reader import read_log
 from epipole.schemas.errors import LogError, LogWarning
+from epipole.schemas.given_settings import with_assumptions
 from epipole.schemas.log_checks import CheckVerdict
 from epipole.schemas.settings import Settings
 from epipole.tasks.report.night_facts import needs_look, read_night_facts
@@ -49,6 +50,20 @@ def test_a_mistake_ends_with_1_and_has_its_cure(wrong_log):
     (mistake,) = found["mistakes"]
     assert mistake.startswith("sat2: velocities point backwards along the path of positions; ")
     assert lines(doctor([str(wrong_log)]))[-1] == f"  {mistake}"
+
+
+@pytest.mark.parametrize(
+    ("mistake", "cure"),
+    [
+        ("positions in m", "position_unit=m"),
+        ("velocities in m/s", "velocity_unit=m/s"),
+        ("frames as GPS time", "frames_ahead_s=18"),
+    ],
+)
+def test_a_log_that_is_read_as_it_was_meant_has_no_mistake(night_log, tmp_path, mistake, cure):
+    log = rewritten(MISTAKES[mistake][0](read_log(night_log), ["sat2"]), tmp_path / "a.mcap")
+    assert run("doctor", log).exit_code == 1
+    assert run("doctor", log, "--assume", f"sat2.{cure}").exit_code == 0
 
 
 def test_what_a_run_would_leave_out_ends_with_1(night_log, tmp_path):
@@ -166,7 +181,10 @@ def test_the_start_of_exposures_is_named_and_positions_carry_the_doubt(
     summary = nightly([str(wrong)], str(tmp_path / "out"))
     (mistake,) = summary.mistakes
     assert mistake.startswith("sat1, sat2, sat3, sat4: times of frames are -0.49")
-    assert mistake.endswith("write the middle of the exposure")
+    assert mistake.endswith("write the middle of the exposure, or assume `frame_time` (`--assume`)")
     assert summary.verdicts == {"sensors_in_doubt": 9}
     # Without the doubt, none of the positions is within its ellipsoid.
     assert evaluate(tmp_path / "out", night_log).nees_in_99 > 0.95
+    as_meant = with_assumptions(Settings(), ["*.frame_time=start"])
+    summary = nightly([str(wrong)], str(tmp_path / "meant"), settings=as_meant)
+    assert (summary.mistakes, summary.verdicts) == ([], {"sound": 9})

@@ -119,7 +119,8 @@ def metres(state, *sensors):
 
 def test_units_are_read_before_bounds_are_checked(piece):
     # Metres a second are faster than any velocity may be: all states of sat1 would be left out.
-    assumed = in_kilometres([Assumption(sensor="sat1", position_unit="m", velocity_unit="m/s")])
+    units = {"position_unit": "m", "position_sigma_unit": "m", "velocity_unit": "m/s"}
+    assumed = in_kilometres([Assumption(sensor="sat1", **units)])
     (wrong,) = read_log_pieces(EXAMPLE, as_meant=lambda state: metres(state, "sat1"))
     (right,) = read_log_pieces(EXAMPLE, as_meant=lambda state: assumed(metres(state, "sat1")))
     assert "sat1" not in set(wrong.states["sensor_id"].to_pylist())
@@ -134,7 +135,9 @@ def test_units_are_those_of_the_sensor_that_is_named():
     one, every = Assumption(sensor="sat1", position_unit="m"), Assumption(position_unit="m")
     assert in_kilometres([one])(state) is state
     assert in_kilometres([every])(state).position_km.tolist() == [7000.0, 0.0, 0.0]
-    assert in_kilometres([every])(state).position_sigma_km == 0.05
+    assert in_kilometres([every])(state).position_sigma_km == 50.0
+    sigma = Assumption(position_sigma_unit="m")
+    assert in_kilometres([every, sigma])(state).position_sigma_km == 0.05
     assert in_kilometres([Assumption(time="gps")]) is None
 
 
