@@ -238,7 +238,9 @@ def star_map(facts: NightFacts) -> Section:
     """Return the section with one frame as a map."""
     title, frame = "One frame", facts.star_map
     if frame is None:
-        return Section("frame", title, nothing("No frame is identified."))
+        identified = facts.series is not None and facts.series.counts[0].any()
+        why = "The table `stars` has no frame to draw." if identified else "No frame is identified."
+        return Section("frame", title, nothing(why) + _concerned(facts))
     size = facts.size_px(frame.sensor_id)
     scale = vector_scale(frame.residuals_px, size)
     ids = star_ids(facts.star_catalogue)

@@ -180,7 +180,8 @@ class StarMap(NamedTuple):
 def read_star_map(night: NightReader, series: FrameSeries) -> StarMap | None:
     """Return a frame near the middle of the night with as many stars as is usual for its sensor.
 
-    It is of the sensor with the most identified frames. None: no frame is identified.
+    It is of the sensor with the most identified frames. None: no frame is identified, or the
+    table `stars` leaves out all of that sensor.
     """
     identified = series.counts[0]
     if not identified.sum():
@@ -207,11 +208,14 @@ def read_frame_concerned(night: NightReader, series: FrameSeries, k: int) -> Sta
     bin_ = int(np.argmax(failed if failed.any() else residual))
     length = (series.bins.end_ns - series.bins.start_ns) / series.bins.number
     start = series.bins.start_ns + int(bin_ * length)
+    between_ns = start, start + int(length) + 2
     columns = ["time", "sensor_id", "frame_number", "status", "residual_px"]
-    pieces = night.pieces("frames", columns, (start, start + int(length) + 2))
+    pieces = night.pieces("frames", columns, between_ns)
     of_sensor = [rows.filter(sensor_id=series.sensors[k]) for rows in pieces]
     found = pl.concat([night.empty("frames", columns), *of_sensor])
     chosen = found.drop_nulls("status") if failed.any() else found.drop_nulls("residual_px")
+    drawable = chosen.filter(_in_stars(night, series.sensors[k], between_ns))
+    chosen = drawable if len(drawable) else chosen
     chosen = chosen.sort("residual_px", descending=True, nulls_last=True, maintain_order=True)
     if not len(chosen):
         return None
@@ -255,22 +259,38 @@ def _of_other(row: dict[str, Any]) -> str:
 def _usual_frame(
     night: NightReader, series: FrameSeries, k: int, bin_: int
 ) -> tuple[int, int] | None:
-    """Return number and time of the frame whose number of stars is nearest to the mean."""
+    """Return number and time of the frame whose number of stars is nearest to the mean.
+
+    Of the frames whose stars are published (`stars_every` leaves out those of others): in a part
+    of the bin, else in all of it, else in the whole night.
+    """
     length = (series.bins.end_ns - series.bins.start_ns) / series.bins.number
     start = series.bins.start_ns + int(bin_ * length)
-    best: tuple[float, int, int] | None = None
     columns = ["time", "sensor_id", "frame_number", "attitude_source", "n_stars"]
-    for searched in (min(int(length) + 1, SEARCHED_NS), int(length) + 2):
-        for rows in night.pieces("frames", columns, (start, start + searched)):
-            frames = rows.filter(sensor_id=series.sensors[k], attitude_source="stars")
-            off = np.abs(frames["n_stars"].to_numpy() - series.stars[k])
-            if len(frames) and (best is None or off.min() < best[0]):
-                at = int(np.argmin(off))
-                time_ns = int(frames["time"].dt.epoch("ns")[at])
-                best = float(off[at]), int(frames["frame_number"][at]), time_ns
-        if best is not None:
-            return best[1:]
+    for between_ns in (
+        (start, start + min(int(length) + 1, SEARCHED_NS)),
+        (start, start + int(length) + 2),
+        (series.bins.start_ns, series.bins.end_ns),
+    ):
+        is_drawable = _in_stars(night, series.sensors[k], between_ns)
+        of_sensor = [
+            rows.filter(is_drawable, sensor_id=series.sensors[k], attitude_source="stars")
+            for rows in night.pieces("frames", columns, between_ns)
+        ]
+        frames = pl.concat([night.empty("frames", columns), *of_sensor])
+        if len(frames):
+            at = int(np.argmin(np.abs(frames["n_stars"].to_numpy() - series.stars[k])))
+            return int(frames["frame_number"][at]), int(frames["time"].dt.epoch("ns")[at])
     return None
+
+
+def _in_stars(night: NightReader, sensor_id: str, between_ns: tuple[int, int]) -> pl.Expr:
+    """Return whether a frame of a sensor is in the table `stars`, by its number."""
+    numbers = [
+        rows.filter(sensor_id=sensor_id)["frame_number"].unique()
+        for rows in night.pieces("stars", ["time", "sensor_id", "frame_number"], between_ns)
+    ]
+    return pl.col("frame_number").is_in(pl.concat([pl.Series(dtype=pl.Int64), *numbers]).implode())
 
 
 def _rows(night: NightReader, table: str, columns: list[str], time_ns: int) -> pl.DataFrame:

@@ -3,10 +3,17 @@
 import tracemalloc
 
 import numpy as np
-from scenes.made_nights import START_NS, filled, reader_of
+from scenes.made_nights import SECOND_NS, START_NS, filled, reader_of, seconds
 
 from epipole.tasks.algorithms.constants import ARCSEC
-from epipole.tasks.report.stars import CELLS, HISTOGRAM, read_star_residuals
+from epipole.tasks.report.frame_series import read_frame_series
+from epipole.tasks.report.stars import (
+    CELLS,
+    HISTOGRAM,
+    read_frame_concerned,
+    read_star_map,
+    read_star_residuals,
+)
 
 SIGMA_PX, FOCAL_PX, STARS = 0.1, 1000.0, 20
 
@@ -74,3 +81,27 @@ def test_without_calibrations_there_is_no_sigma_but_a_pattern():
 
 def test_a_night_without_stars_has_no_residuals():
     assert found(reader_of({})) is None
+
+
+def published_every(step):
+    """Return 40 frames of 2 stars, the third with the largest residual; stars of every n-th."""
+    n = 40
+    numbers = np.repeat(np.arange(0, n, step), 2)
+    return reader_of({
+        "frames": filled("frames", sensor_id=["a"] * n, time=seconds(n), frame_number=np.arange(n),
+                         attitude_source=["stars"] * n, n_stars=[2] * n,
+                         residual_px=[0.1, 0.1, 0.3] + [0.1] * (n - 3)),
+        "stars": filled("stars", sensor_id=["a"] * len(numbers), frame_number=numbers,
+                        time=START_NS + numbers * SECOND_NS),
+    })  # fmt: skip
+
+
+def test_the_map_is_of_a_frame_whose_stars_are_published():
+    for step, in_middle, concerned in ((1, 20, 2), (7, 21, 0), (16, 0, 0)):
+        made = published_every(step)
+        series = read_frame_series(made)
+        frames = read_star_map(made, series), read_frame_concerned(made, series, 0)
+        assert [frame.frame_number for frame in frames] == [in_middle, concerned]
+        assert [len(frame.star_id) for frame in frames] == [2, 2]
+    assert read_star_map(published_every(100), series).frame_number == 0
+    assert read_star_map(reader_of({}), series) is None
