@@ -34,7 +34,7 @@ from epipole.flows.night.recorded_nights import (
     write_night_row,
 )
 from epipole.flows.night.reports import with_reports
-from epipole.flows.night.run_records import Stopwatch, read_records, with_looks, write_record
+from epipole.flows.night.run_records import Stopwatch, record_unchanged, write_record
 from epipole.flows.night.stages import (
     Destination,
     check,
@@ -80,8 +80,6 @@ from epipole.tasks.publish.write_tables import into_nights, source_table
 from epipole.tasks.read.order_frames import OrderedFrames
 
 LOGGER = logging.getLogger(__name__)
-
-COUNTED = ("sensors", "frames", "identified", "objects", "positions")  # as metrics
 
 
 @flow(
@@ -190,17 +188,15 @@ def recorded(order: Order, night: str | None, asked: bool = True) -> Summary:
             if is_new and (is_empty or not asked):
                 tell(order.out, night, f"{state.value}: {line}")
         raise
-    records = read_records(order.out, summary.nights) if summary.unchanged else {}
+    if summary.unchanged:
+        return record_unchanged(summary, used, order.settings)
     for date in summary.nights:
-        if date in records and records[date]["state"] == RunState.MADE:
-            continue
         looks = summary.looks.get(date, [])
-        counts = {name: getattr(summary, name) for name in COUNTED}
         is_new = write_record(order.out, date, RunState.MADE, summary.sentence(), used,
-                              order.settings, looks, counts)  # fmt: skip
+                              order.settings, looks)  # fmt: skip
         if looks and is_new:
             tell(order.out, date, f"needs a look: {'; '.join(looks)}")
-    return with_looks(summary) if summary.unchanged else summary
+    return summary
 
 
 def make_nights(order: Order, night: str | None) -> Summary:

@@ -12,7 +12,7 @@ from epipole.flows.command_line.terminal import shown
 from epipole.flows.night.log_choice import find_logs
 from epipole.flows.night.progress import compile_step, prepare
 from epipole.flows.night.recorded_nights import published_night, unchanged_nights
-from epipole.flows.night.run_records import Stopwatch, with_looks, write_record
+from epipole.flows.night.run_records import Stopwatch, record_unchanged, write_record
 from epipole.flows.night.summary import Summary, summarise
 from epipole.flows.prefect.server_process import Launched, launch
 from epipole.io.caches.kernel_compiler import (
@@ -159,7 +159,10 @@ class Nights:
             raise
         same = unchanged_nights(self._out, given, night, self._settings, self._known_key)
         locations = {date: night_location(self._out, date) for date in same}
-        return with_looks(summarise(self._out, locations, unchanged=True)) if same else None
+        if not same:
+            return None
+        summary = summarise(self._out, locations, unchanged=True)
+        return record_unchanged(summary, used, self._settings)
 
     def _start(self, started: contextlib.ExitStack) -> Callable[[str | None], Summary]:
         """Start Prefect, and return what makes a night."""

@@ -18,7 +18,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from epipole.flows.night.summary import Summary
-from epipole.io.datasets.dataset import nights_in, read_beside, read_table, write_beside
+from epipole.io.datasets.dataset import night_row, nights_in, read_beside, read_table, write_beside
 from epipole.io.datasets.local import RUNS as RUNS_FOLDER
 from epipole.io.work.recipe import LIBRARIES
 from epipole.schemas.bridge import table
@@ -31,6 +31,7 @@ from epipole.schemas.settings import Settings
 LOGGER = logging.getLogger(__name__)
 
 METRICS = "last.prom"  # OpenMetrics, of the last run
+COUNTED = ("sensors", "frames", "identified", "objects", "positions")  # of a night, as metrics
 _BROKEN = {
     Reason.NO_MCAP.value: "is no MCAP file; it is on no night",
     Reason.NOTHING_READ.value: "has nothing that can be used; it is on no night",
@@ -65,18 +66,18 @@ def write_record(
     message: str,
     used: Stopwatch,
     settings: Settings,
-    needs_look: Sequence[str] = (),
-    counts: Mapping[str, int] | None = None,
+    needs_look: Sequence[str] | None = None,
 ) -> bool:  # fmt: skip
     """Write the record of a night's run; return whether it says something new.
 
-    A record that cannot be written is a warning. `counts` are of the night, for the metrics.
+    A record that cannot be written is a warning. None for `needs_look`: the run has published
+    nothing of the night, so what needed a look before still does.
     """
     row = {
         "night": night,
         "state": state.value,
         "message": message,
-        "needs_look": list(needs_look),
+        "needs_look": list(needs_look or ()),
         "ended": int(time.time()) * 1_000_000_000,  # whole seconds: Python's datetime takes them
         "duration_s": time.monotonic() - used.begun_s,
         "cpu_s": time.process_time() - used.cpu_s,
@@ -88,15 +89,24 @@ def write_record(
     }
     try:
         before = read_records(dataset, [night]).get(night)
+        if needs_look is None and before is not None:
+            row["needs_look"] = before["needs_look"]
+        counts = _counts(dataset, night) if state == RunState.MADE else {}
         file = pa.BufferOutputStream()
         pq.write_table(table(RUNS, {name: [value] for name, value in row.items()}), file)
         write_beside(dataset, RUNS_FOLDER, f"{night}.parquet", file.getvalue().to_pybytes())
-        write_beside(dataset, RUNS_FOLDER, METRICS, metrics(row, counts or {}).encode())
+        write_beside(dataset, RUNS_FOLDER, METRICS, metrics(row, counts).encode())
     except DatasetError as error:
         LOGGER.warning("the run of %s could not be recorded: %s", night, error)
         return True
     compared = ("state", "needs_look", *(["message"] if state is RunState.FAILED else []))
     return before is None or any(before[name] != row[name] for name in compared)
+
+
+def _counts(dataset: str, night: str) -> dict[str, int]:
+    """Return the counts of a published night that are metrics."""
+    row = night_row(dataset, night) or {}
+    return {name: row[name] for name in COUNTED if name in row}
 
 
 def metrics(row: Mapping[str, Any], counts: Mapping[str, int]) -> str:
@@ -121,9 +131,15 @@ def metrics(row: Mapping[str, Any], counts: Mapping[str, int]) -> str:
     return "\n".join([*lines, "# EOF"]) + "\n"
 
 
-def with_looks(summary: Summary) -> Summary:
-    """Return the summary of unchanged nights with what needed a look when they were made."""
+def record_unchanged(summary: Summary, used: Stopwatch, settings: Settings) -> Summary:
+    """Return the summary of unchanged nights with what needed a look when they were made.
+
+    A night whose last run did not publish it, or has no record, gets a record: it is made.
+    """
     records = read_records(summary.dataset, summary.nights)
+    for night in summary.nights:
+        if night not in records or records[night]["state"] != RunState.MADE:
+            write_record(summary.dataset, night, RunState.MADE, summary.sentence(), used, settings)
     found = {n: records[n]["needs_look"] for n in summary.nights if n in records}
     return replace(summary, looks=found)
 
