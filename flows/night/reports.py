@@ -27,7 +27,8 @@ LOGGER = logging.getLogger(__name__)
 def with_reports(summary: Summary, staged: Mapping[str, Path], write: bool) -> Summary:
     """Write the reports of published nights; return the summary with what needs a look.
 
-    The nights are published: whatever happens here, the run has succeeded. So an error is a line.
+    The nights are published: whatever happens here, the run has succeeded. So an error is a line,
+    and the other nights have their reports.
 
     Parameters
     ----------
@@ -42,7 +43,11 @@ def with_reports(summary: Summary, staged: Mapping[str, Path], write: bool) -> S
     try:
         write = write and _can_draw()
         nights = nights_in(summary.dataset)
-        for night in summary.nights:
+    except Exception as error:  # of the library that draws, of the store
+        LOGGER.warning("no report could be made: %s", line_of(error))
+        return summary
+    for night in summary.nights:
+        try:
             folder = staged[night] if staged[night].is_dir() else None
             facts = night_facts(summary.dataset, night, nights, folder)
             broken = new_broken_logs(summary.dataset, night)
@@ -51,8 +56,8 @@ def with_reports(summary: Summary, staged: Mapping[str, Path], write: bool) -> S
                 text, extract = _page_and_extract(facts)
                 write_beside(summary.dataset, REPORTS, f"{night}.html", text.encode())
                 extracts.append(extract)
-    except Exception as error:  # of drawing, of the store, of anything: the night is done
-        LOGGER.warning("the report could not be made: %s", line_of(error))
+        except Exception as error:  # of drawing, of the store, of anything: the night is done
+            LOGGER.warning("the report of %s could not be made: %s", night, line_of(error))
     return dataclasses.replace(summary, extracts=tuple(extracts), looks=looks)
 
 

@@ -130,7 +130,7 @@ class Summary:
 
     def needs_look(self) -> list[str]:
         """Return what needs a look, a sentence each."""
-        return _by_night(self.looks)
+        return _by_night({night: self.looks.get(night, ()) for night in self.nights})
 
     def doubtful(self) -> dict[str, int]:
         """Return how many objects are not sound, by verdict."""

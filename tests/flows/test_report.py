@@ -50,7 +50,7 @@ def test_a_report_that_fails_is_a_warning_and_the_night_is_published(
     assert summary.extracts == ()
     assert nights_in(tmp_path / "out") == [NIGHT]
     warnings = [r.getMessage() for r in caplog.records if r.levelname == "WARNING"]
-    assert warnings == ["the report could not be made: no light"]
+    assert warnings == [f"the report of {NIGHT} could not be made: no light"]
 
 
 def test_without_drawing_every_night_is_looked_at(night_run, tmp_path, monkeypatch):
@@ -66,6 +66,31 @@ def test_without_drawing_every_night_is_looked_at(night_run, tmp_path, monkeypat
     made = reports.with_reports(summary, dict.fromkeys(nights, tmp_path / "none"), write=True)
     assert sorted(made.looks) == nights
     assert made.extracts == ()
+
+
+def test_a_report_that_fails_stops_no_other(night_run, tmp_path, monkeypatch):
+    dataset, summary = night_run
+    nights = [NIGHT, "2019-04-02", "2019-04-03"]
+    for night in nights:
+        shutil.copytree(dataset / f"night={NIGHT}", tmp_path / f"night={night}")
+    facts_of, draw = reports.night_facts, reports._page_and_extract
+
+    def facts(dataset, night, *others):
+        if night == nights[0]:
+            raise DatasetError("no facts")
+        return facts_of(dataset, night, *others)
+
+    def drawn(facts):
+        if facts.night == nights[1]:
+            raise RuntimeError("no light")
+        return draw(facts)
+
+    monkeypatch.setattr(reports, "night_facts", facts)
+    monkeypatch.setattr(reports, "_page_and_extract", drawn)
+    summary = dataclasses.replace(summary, dataset=str(tmp_path), nights=nights)
+    made = reports.with_reports(summary, dict.fromkeys(nights, tmp_path / "none"), write=True)
+    assert sorted(made.looks) == nights[1:]
+    assert [path.name for path in (tmp_path / "reports").iterdir()] == [f"{nights[2]}.html"]
 
 
 def without_matplotlib(code, *arguments):

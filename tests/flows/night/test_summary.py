@@ -51,6 +51,14 @@ def test_each_reason_is_shown_with_its_sentence():
     assert lines[at + 2] == f"      2 ambiguous: {Reason.AMBIGUOUS.sentence}"
 
 
+def test_what_needs_a_look_names_its_night_where_there_are_several():
+    from dataclasses import replace
+
+    nights = ["2019-04-01", "2019-04-02"]
+    found = replace(FOUND, nights=nights, looks={nights[1]: ["no stars"]})
+    assert found.needs_look() == ["2019-04-02: no stars"]
+
+
 def test_counts_have_their_noun():
     assert [many(n, "log") for n in (0, 1, 2000)] == ["0 logs", "1 log", "2,000 logs"]
 
