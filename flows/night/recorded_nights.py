@@ -420,12 +420,10 @@ def made_from(dataset: str, night: str, given: FoundLogs) -> MadeFrom | None:
 
 def _all_nights(dataset: str, given: FoundLogs, same: Mapping[str, MadeFrom]) -> bool:
     """Return whether no other night can have frames of the logs of these."""
-    known = {
-        path
-        for date, made in same.items()
-        for path in given.paths
-        if _is_among(path, made.empty) or path in _logs_of(given, date, made)
-    }
+    known: set[str] = set()
+    for date, made in same.items():
+        known.update(path for path in given.paths if _is_among(path, made.empty))
+        known.update(_logs_of(given, date, made))
     dates: set[str] = set()
     for date in same:
         sources = read_table(dataset, "sources", date)

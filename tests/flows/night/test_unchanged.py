@@ -4,7 +4,7 @@ import shutil
 
 import pytest
 
-from epipole.flows.night.log_choice import find_logs
+from epipole.flows.night.log_choice import FoundLogs, find_logs
 from epipole.flows.night.recorded_nights import unchanged_nights
 from epipole.io.work import recipe
 from epipole.schemas.given_settings import validate_settings
@@ -33,6 +33,19 @@ def test_a_night_of_the_same_logs_is_unchanged(night_log, night_dataset, night):
 def test_a_second_copy_of_a_log_changes_nothing(night_log, night_dataset, tmp_path):
     copy = shutil.copy(night_log, tmp_path / "z.mcap")  # sorts behind the other name
     assert found(night_dataset, night_log, copy) == [NIGHT]
+
+
+def test_the_logs_of_a_night_are_chosen_once_however_many_there_are(night_log, night_dataset):
+    asked = []
+
+    class Counted(FoundLogs):
+        def of(self, night):
+            asked.append(night)
+            return super().of(night)
+
+    given = Counted([str(night_log)] * 50, find_logs(str(night_log), None).rejects)
+    assert unchanged_nights(str(night_dataset), given, None, Settings(), None) == [NIGHT]
+    assert len(asked) <= 2
 
 
 def test_other_logs_are_a_change(night_log, dataset, tmp_path):
