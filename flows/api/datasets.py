@@ -34,22 +34,25 @@ class Dataset(Mapping[str, pl.LazyFrame]):
     def __getitem__(self, name: str) -> pl.LazyFrame:
         if name not in TABLES:
             raise KeyError(f"{name}: there is no such table; the tables are {', '.join(TABLES)}")
-        folder = dataset_folder(self._where)
-        if folder is None:
-            return pl.concat([self._of_night(name, night) for night in self.nights])
-        parts = sorted(folder.absolute().glob(f"night=*/{name}/*.parquet"))
         rows: pa.Table = empty(TABLES[name])
+        types = pl.DataFrame(rows).schema
+        folder = dataset_folder(self._where)
+        above = [] if folder is None else _columns_of(folder)
+        if folder is None or not {"night", *types}.isdisjoint(above):
+            return pl.concat([self._of_night(name, night) for night in self.nights])
+        tables = [folder.absolute() / f"night={night}" / name for night in nights_in(self._where)]
+        parts = [part for table in tables for part in sorted(table.glob("*.parquet"))]
         if not parts:
             return pl.LazyFrame(rows).with_columns(night=pl.lit(None, pl.Date))
-        types = pl.DataFrame(rows).schema
         found = pl.scan_parquet(
             parts,
             schema=types,
-            hive_schema={"night": pl.Date},
+            hive_schema={**dict.fromkeys(above, pl.String), "night": pl.Date},
             hive_partitioning=True,
             missing_columns="insert",
             extra_columns="ignore",
-        )
+            glob=False,  # the name of a folder may have a * or [
+        ).drop(above, strict=False)
         added = {k: value for k, value in values_before(rows.schema).items() if value is not None}
         return found.with_columns(
             pl.col(column).fill_null(pl.lit(value, types[column]))
@@ -70,6 +73,12 @@ class Dataset(Mapping[str, pl.LazyFrame]):
 
     def __repr__(self) -> str:
         return f"<{self._where}: {len(self.nights)} nights, tables {', '.join(TABLES)}>"
+
+
+def _columns_of(folder: Path) -> list[str]:
+    """Return the columns that polars makes of a folder's path: one of each part as site=a."""
+    parts = folder.absolute().parts
+    return [part.partition("=")[0] for part in parts if part.count("=") == 1]
 
 
 def open_dataset(dataset: str | Path) -> Dataset:

@@ -1,6 +1,7 @@
 """Datasets as polars tables."""
 
 import datetime
+import shutil
 
 import polars as pl
 import pytest
@@ -43,6 +44,18 @@ def test_nights_of_an_earlier_version_may_lack_columns_and_tables(night_dataset,
     )
     assert by_night["chi2"].to_list() == [by_night["n"][0], 0]
     assert tables["sources"].collect().height == 0
+
+
+@pytest.mark.parametrize("folder", ["out[1]", "a*", "site=a/k=1=2/out", "night=all/sensor_id=b"])
+def test_a_dataset_may_lie_in_any_folder_beside_copies_of_its_nights(
+    folder, night_dataset, tmp_path
+):
+    out = shutil.copytree(night_dataset, tmp_path / folder)
+    shutil.copytree(out / "night=2019-04-01", out / "night=2019-04-01.old")
+    positions = api.open_dataset(out)["positions"].collect()
+    published = api.open_dataset(night_dataset)["positions"].collect()
+    assert positions.equals(published)
+    assert positions.schema == published.schema
 
 
 def test_a_dataset_in_a_store_has_the_same_rows(night_dataset, tmp_path):
