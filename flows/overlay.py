@@ -117,8 +117,12 @@ def overlay(
 
 
 def _calibrations(file: ViewerFile, given: _Logs, night: str) -> None:
-    """Write the calibrations of a night; the first of a sensor holds from its first frame."""
+    """Write the calibrations of a night: the last one before it, and those in it.
+
+    The first of a sensor holds from its first frame.
+    """
     start_ns = day_of(night) * DAY_NS
+    end_ns = start_ns + DAY_NS
     first_ns = dict(
         given.frames.group_by("sensor_id")
         .agg(pl.col("time").min().dt.timestamp("ns"))
@@ -130,9 +134,12 @@ def _calibrations(file: ViewerFile, given: _Logs, night: str) -> None:
         "sensor_id", as_dict=True, maintain_order=True
     ).items():
         times_ns = cameras["time"].dt.timestamp("ns").to_list()
-        for number, row in enumerate(cameras.iter_rows(named=True)):
-            since_ns = times_ns[number] if number else first_ns.get(sensor, times_ns[0])
-            file.calibration(str(sensor), max(since_ns, start_ns), row)
+        times_ns[0] = min([first_ns.get(sensor, times_ns[0]), *times_ns[1:2]])
+        ends_ns = [*times_ns[1:], end_ns]
+        named = cameras.iter_rows(named=True)
+        for since_ns, until_ns, row in zip(times_ns, ends_ns, named, strict=True):
+            if since_ns < end_ns and until_ns > start_ns:
+                file.calibration(str(sensor), max(since_ns, start_ns), row)
 
 
 def _of_night(

@@ -516,6 +516,12 @@ class FrameStatus(Declared):
     NO_CALIBRATION = "no_calibration", "No calibration is valid for the frame."
 
 
+def sentence_of(reason: str) -> str:
+    """Return what a reason in `rejects` means; a night of another version may have others."""
+    known = {each.value: each.sentence for each in Reason}
+    return known.get(reason, "A reason of another version of the program.")
+
+
 def by_reason(rejects: pa.Table) -> dict[str, int]:
     """Return the counts of what was left out, by reason, the most frequent first."""
     counts = rejects.group_by("reason").aggregate([("count", "sum")])

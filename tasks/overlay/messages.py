@@ -11,7 +11,7 @@ from foxglove_schemas_protobuf.Log_pb2 import Log
 
 from epipole.schemas.bridge import to_polars
 from epipole.schemas.columns import POSITION
-from epipole.schemas.rejects import Reason
+from epipole.schemas.rejects import sentence_of
 from epipole.schemas.work_tables import CAMERAS
 from epipole.tasks.overlay.annotations import (
     DetectedSpot,
@@ -120,7 +120,7 @@ def log_messages(rejects: pl.DataFrame) -> Iterator[ViewerMessage]:
     """Yield a line of log for each row of REJECTS."""
     for row in _timed(rejects, "time").iter_rows(named=True):
         about = " ".join(filter(None, (row["source"], row["sensor_id"], row["tracklet_id"])))
-        text = f"{about}: {Reason(row['reason']).sentence} ({row['count']:,})"
+        text = f"{about}: {sentence_of(row['reason'])} ({row['count']:,})"
         yield log_message(row["time_ns"], Log.Level.WARNING, row["stage"], text)
 
 

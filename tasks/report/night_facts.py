@@ -13,7 +13,7 @@ import polars as pl
 from epipole.io.datasets.night_tables import NightReader
 from epipole.schemas.arrays import Flags
 from epipole.schemas.log_checks import MISTAKE_COLUMNS, mistakes
-from epipole.schemas.rejects import NameStatus, ObjectVerdict, Reason, Trait
+from epipole.schemas.rejects import NameStatus, ObjectVerdict, Reason, Trait, sentence_of
 from epipole.schemas.stages import Stage
 from epipole.tasks.report.epipolar_views import (
     OPTICS,
@@ -57,8 +57,7 @@ class LeftOut(NamedTuple):
     @property
     def sentence(self) -> str:
         """What the reason means."""
-        known = {reason.value: reason.sentence for reason in Reason}
-        return known.get(self.reason, "A reason of another version of the program.")
+        return sentence_of(self.reason)
 
 
 def read_left_out(night: NightReader) -> list[LeftOut]:

@@ -1,5 +1,6 @@
 """The overlay of a night: read back by public tools, and held against tables and geometry."""
 
+import datetime
 import json
 import shutil
 from collections import Counter, defaultdict
@@ -15,6 +16,7 @@ from typer.testing import CliRunner
 
 from epipole.flows.command_line.main import app
 from epipole.flows.overlay import overlay
+from epipole.flows.simulate import simulate
 from epipole.schemas.errors import DatasetError, NoFramesError
 from epipole.tasks.overlay.layout import viewer_layout
 
@@ -172,6 +174,16 @@ def test_the_same_night_gives_the_same_bytes(written, night_log, night_dataset, 
 def test_without_images_there_are_none(night_log, night_dataset, tmp_path):
     overlay(str(night_dataset), [str(night_log)], tmp_path / "x.mcap")
     assert "foxglove.CompressedImage" not in messages(tmp_path / "x.mcap")
+
+
+def test_calibrations_are_those_of_the_night(night_log, night_dataset, tmp_path):
+    start = datetime.datetime(2019, 4, 2, 4, tzinfo=datetime.UTC)
+    simulate("four_sensor_geo", tmp_path / "next.mcap", seed=7, seconds=2, start=start)
+    logs = [str(night_log), str(tmp_path / "next.mcap")]
+    overlay(str(night_dataset), logs, tmp_path / "x.mcap", night=NIGHT)
+    found = messages(tmp_path / "x.mcap")["foxglove.CameraCalibration"]
+    days = Counter(str(np.datetime64(time_ns, "ns"))[:10] for _, time_ns, _ in found)
+    assert days == {NIGHT: 4}
 
 
 def test_a_night_that_the_dataset_does_not_have_is_one_line(night_log, night_dataset, tmp_path):
