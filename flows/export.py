@@ -75,8 +75,17 @@ def export(kind: Message, dataset: str, night: str, out: Path, wanted: Wanted = 
     Raises
     ------
     DatasetError
-        Where the night or an object does not exist, or the folder is not empty.
+        Where the night or an object does not exist, the folder is not empty, or it cannot be made.
     """
+    asked = wanted._replace(object_ids=list(dict.fromkeys(wanted.object_ids)))
+    try:
+        return _exported(kind, dataset, night, out, asked)
+    except OSError as error:
+        raise DatasetError(f"{out}: cannot be made ({error.strerror or error})") from error
+
+
+def _exported(kind: Message, dataset: str, night: str, out: Path, wanted: Wanted) -> list[str]:
+    """Do as `export` says; no id is asked for twice."""
     _check_out(out)
     if night not in nights_in(dataset):
         raise DatasetError(f"{dataset}: has no night {night}")
@@ -181,7 +190,8 @@ def _write_states(kind: Message, night: _NightTables, wanted: Wanted, folder: Pa
     moved = kind != Message.opm
     around = surroundings_of(night.night, round(wanted.ahead_h * HOUR_NS))
     origin_ns = noon_ns(night.night)
-    positions = night.read("positions") if moved else pl.DataFrame()
+    rows = night.read("positions") if moved else pl.DataFrame({"object_id": []})
+    positions = night.by_id(rows, "object_id")
     for name, file in _file_names(names, _ending(kind.value, wanted.form)).items():
         orbit = orbits.get(name)
         if orbit is not None:
@@ -191,7 +201,7 @@ def _write_states(kind: Message, night: _NightTables, wanted: Wanted, folder: Pa
             comments += [OF_AHEAD] if moved and ahead_s else []
         elif moved:
             comments = [OF_ARC]
-            parts = arcs(states[name], positions.filter(pl.col("object_id") == name))
+            parts = arcs(states[name], positions.get(name, rows.clear()))
         else:
             comments, parts = [OF_STATE], single_states(states[name].sort("epoch"))
         parts = [in_frame(part, wanted.frame.value) for part in parts]
@@ -219,13 +229,15 @@ def _ending(kind: str, form: MessageForm) -> str:
 
 def _file_names(names: Sequence[str], ending: str) -> Mapping[str, str]:
     """Return a file name for each name; those that would be the same get a number."""
-    taken: dict[str, str] = {}
+    files: dict[str, str] = {}
+    taken: set[str] = set()
     for name in names:
         file, number = f"{safe_name(name)}.{ending}", 2
-        while file in taken.values():
+        while file in taken:
             file, number = f"{safe_name(name)}-{number}.{ending}", number + 1
-        taken[name] = file
-    return taken
+        files[name] = file
+        taken.add(file)
+    return files
 
 
 def _check_out(out: Path) -> None:
@@ -240,8 +252,5 @@ def _check_out(out: Path) -> None:
 def _parent(out: Path) -> Path:
     """Return the folder in which `out` lies; it is made."""
     parent = out.resolve().parent
-    try:
-        parent.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise DatasetError(f"{out}: cannot be made ({error.strerror})") from error
+    parent.mkdir(parents=True, exist_ok=True)
     return parent

@@ -171,6 +171,21 @@ def test_one_object_can_be_asked_for(night_dataset, tmp_path):
     assert [f for f in files if f.endswith("tdm")] == [f"{name}.tdm"]
 
 
+def test_an_object_that_is_asked_for_twice_is_one_file(night_dataset, tmp_path):
+    name = observed(night_dataset, "orbits")["object_id"][0]
+    files = export(Message.oem, str(night_dataset), NIGHT, tmp_path / "a", Wanted([name, name]))
+    assert files == [f"{name}.oem"]
+
+
+def test_a_folder_that_cannot_be_written_is_one_line(night_dataset, tmp_path, monkeypatch):
+    def move(*_):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("epipole.flows.export.shutil.move", move)
+    with pytest.raises(DatasetError, match=r"out: cannot be made \(No space left on device\)"):
+        export(Message.ades, str(night_dataset), NIGHT, tmp_path / "out")
+
+
 def an_object_that_is_not_there(out):
     return {"wanted": Wanted(["20190401-99999"])}, "no observations of 20190401-99999"
 
