@@ -4,12 +4,12 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
-import numpy as np
+import polars as pl
 import pyarrow as pa
 import pyarrow.compute as pc
 
 from epipole.io.datasets.night_tables import Where, count_rows, read_columns
-from epipole.schemas.bridge import array
+from epipole.schemas.bridge import to_polars
 from epipole.schemas.log_checks import MISTAKE_COLUMNS, mistakes
 from epipole.schemas.rejects import NameStatus, ObjectVerdict, Outcome, Reason, by_reason
 from epipole.schemas.stages import Declared
@@ -185,7 +185,11 @@ _COLUMNS = {
 
 def count(folders: Sequence[Where]) -> dict[str, int]:
     """Return the counts of nights together, as the table `nights` has them of one night."""
-    tables = _tables(folders)
+    return _count(folders, _tables(folders))
+
+
+def _count(folders: Sequence[Where], tables: Mapping[str, pa.Table]) -> dict[str, int]:
+    """Do as `count` says, with what `_tables` returns."""
     frames = tables["frames"]
     return {
         "logs": pc.count_distinct(tables["sources"]["sha256"]).as_py(),
@@ -205,9 +209,9 @@ def count(folders: Sequence[Where]) -> dict[str, int]:
 def summarise(dataset: str, nights: Mapping[str, Where], unchanged: bool = False) -> Summary:
     """Return the summary of nights, by the folder or URL of each."""
     folders = list(nights.values())
-    tables, counts = _tables(folders), count(folders)
+    tables = _tables(folders)
+    counts = _count(folders, tables)
     counts.pop("left_out")  # given by reason
-    frames = tables["frames"]
     rows = {
         night: read_columns(folder, "nights", ["faults", "residuals"]).to_pylist()[0]
         for night, folder in nights.items()
@@ -230,10 +234,7 @@ def summarise(dataset: str, nights: Mapping[str, Where], unchanged: bool = False
         faults=_by_night({night: row["faults"] for night, row in rows.items()}),
         residuals=_by_night({night: row["residuals"] for night, row in rows.items()}),
         unchanged=unchanged,
-        by_sensor=[
-            _of_sensor(frames.filter(pc.field("sensor_id") == name), tables["tracklets"], name)
-            for name in sorted(pc.unique(frames["sensor_id"]).to_pylist())
-        ],
+        by_sensor=_by_sensor(to_polars(tables["frames"]), to_polars(tables["tracklets"])),
         extracts=(),
         looks={},
         earlier=(),
@@ -269,19 +270,20 @@ def _by_night(sentences: Mapping[str, Sequence[str]]) -> list[str]:
     ]
 
 
-def _of_sensor(frames: pa.Table, tracklets: pa.Table, sensor_id: str) -> SensorSummary:
-    tracklets = tracklets.filter(pc.field("sensor_id") == sensor_id)
-    residual_px = frames["residual_px"].drop_null().to_numpy()
-    identified = frames.filter(pc.field("attitude_source") == "stars")
-    times_ns = np.sort(array(identified, "time"))
-    return SensorSummary(
-        sensor_id=sensor_id,
-        frames=frames.num_rows,
-        identified=pc.sum(pc.equal(frames["attitude_source"], "stars")).as_py() or 0,
-        residual_px=float(np.median(residual_px)) if len(residual_px) else None,
-        gap_s=float(np.diff(times_ns).max() * 1e-9) if len(times_ns) > 1 else None,
-        tracks=pc.count_distinct(tracklets["track_id"]).as_py(),
+def _by_sensor(frames: pl.DataFrame, tracklets: pl.DataFrame) -> list[SensorSummary]:
+    """Return the counts of each sensor with frames, in the order of the ids."""
+    is_identified = pl.col("attitude_source") == "stars"
+    identified_ns = pl.col("time").filter(is_identified).dt.epoch("ns")
+    of_frames = frames.group_by("sensor_id").agg(
+        frames=pl.len(),
+        identified=is_identified.sum(),
+        residual_px=pl.col("residual_px").median(),
+        gap_s=identified_ns.sort().diff().max() * 1e-9,
     )
+    of_tracks = tracklets.group_by("sensor_id").agg(tracks=pl.col("track_id").n_unique())
+    rows = of_frames.join(of_tracks, on="sensor_id", how="left").sort("sensor_id")
+    rows = rows.with_columns(pl.col("tracks").fill_null(0))
+    return [SensorSummary(**row) for row in rows.iter_rows(named=True)]
 
 
 def many(count: int, what: str) -> str:

@@ -3,7 +3,7 @@
 `read_night_facts` computes all of it from the tables; the page and Prefect's page only show it.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from statistics import median
 from typing import NamedTuple
 
@@ -190,7 +190,7 @@ def _concerned(
     wrong = {series.sensors[k] for k in np.flatnonzero(_is_poor(series))}
     if residuals is not None:
         wrong |= {name for name, _ in _residuals_off(residuals)}
-    share = {name: series.identified_share[series.sensors.index(name)] for name in wrong}
+    share = dict(zip(series.sensors, series.identified_share.tolist(), strict=True))
     order = sorted(wrong, key=lambda name: (share[name], name))
     frames = {
         name: read_frame_concerned(night, series, series.sensors.index(name))
@@ -245,9 +245,10 @@ def _sensors(facts: NightFacts) -> Iterator[Look]:
     series = facts.series
     if series is None:
         return
+    shares, failed = series.identified_share, _failed_by_sensor(series)
     for k in np.flatnonzero(_is_poor(series)).tolist():
-        name, share = series.sensors[k], series.identified_share[k]
-        identified = f"{percent(share)} of its frames are identified{_why(series, name)}"
+        name, why = series.sensors[k], _why(failed.get(series.sensors[k], {}))
+        identified = f"{percent(shares[k])} of its frames are identified{why}"
         yield Look(f"{name}: {identified}.", _frame_of(facts, name, "coverage"))
 
 
@@ -261,12 +262,16 @@ def _frame_of(facts: NightFacts, name: str, otherwise: str) -> str:
     return f"frame-{shown.index(name) + 1}" if name in shown else otherwise
 
 
-def _why(series: FrameSeries, name: str) -> str:
-    reasons = {status: n for (sensor, status), n in series.failed.items() if sensor == name}
-    if not reasons:
-        return ""
-    status = max(reasons, key=lambda key: reasons[key])
-    return f"; most others: {status}"
+def _failed_by_sensor(series: FrameSeries) -> dict[str, dict[str, int]]:
+    found: dict[str, dict[str, int]] = {}
+    for (sensor, status), count in series.failed.items():
+        found.setdefault(sensor, {})[status] = count
+    return found
+
+
+def _why(failed: Mapping[str, int]) -> str:
+    """Return why most frames that are not identified are not, of counts by status."""
+    return f"; most others: {max(failed, key=lambda status: failed[status])}" if failed else ""
 
 
 def _residuals_off(residuals: StarResiduals) -> Iterator[tuple[str, float]]:

@@ -66,9 +66,10 @@ def read_star_residuals(
 
 def _sigmas_px(night: NightReader, sensors: list[str], calibrations: pl.DataFrame) -> Array:
     focal_px = np.full(len(sensors), np.nan)
+    number = {name: k for k, name in enumerate(sensors)}
     for name, fx, fy in calibrations.select("sensor_id", "fx_px", "fy_px").iter_rows():
-        if name in sensors:
-            focal_px[sensors.index(name)] = np.sqrt(abs(fx * fy))
+        if name in number:
+            focal_px[number[name]] = np.sqrt(abs(fx * fy))
     counts = np.zeros((len(sensors), len(SIGMA_BINS) + 1), np.int64)
     for rows in night.pieces("detections", ["sensor_id", "sigma_arcsec"]):
         at = np.searchsorted(SIGMA_BINS, rows["sigma_arcsec"].to_numpy())
@@ -84,12 +85,13 @@ def _sigmas_px(night: NightReader, sensors: list[str], calibrations: pl.DataFram
 def _sizes(night: NightReader, sensors: list[str]) -> Array:
     """Return the largest pixel positions of stars and detections: nearly the size of the image."""
     largest = np.ones((len(sensors), 2))
+    number = {name: k for k, name in enumerate(sensors)}
     for table in ("stars", "detections"):
         for rows in night.pieces(table, ["sensor_id", "x_px", "y_px"]):
             of_sensor = rows.group_by("sensor_id").agg(pl.col("x_px", "y_px").max())
             for name, x, y in of_sensor.iter_rows():
-                if name in sensors:
-                    k = sensors.index(name)
+                if name in number:
+                    k = number[name]
                     largest[k] = np.maximum(largest[k], [x + 1.0, y + 1.0])
     return largest
 

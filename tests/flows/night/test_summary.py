@@ -6,6 +6,7 @@ import numpy as np
 import pyarrow as pa
 from scenes.associations import filled
 
+from epipole.flows.night import summary as summaries
 from epipole.flows.night.summary import Summary, many, summarise
 from epipole.io.datasets.night_tables import write_table
 from epipole.schemas.rejects import Reason, reject_rows
@@ -128,3 +129,15 @@ def test_staged_nights_are_counted_together(tmp_path):
         },
     ]  # fmt: skip
     assert summary.as_dict()["by_sensor"][1]["residual_px"] is None
+
+
+def test_each_table_is_read_once(tmp_path, monkeypatch):
+    read, names = summaries.read_columns, []
+
+    def counted(folder, name, columns):
+        names.append(name)
+        return read(folder, name, columns)
+
+    monkeypatch.setattr(summaries, "read_columns", counted)
+    summarise("/data", {"2019-04-01": staged(tmp_path, nights={"faults": [[]]})})
+    assert sorted(names) == sorted(set(names))
