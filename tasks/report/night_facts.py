@@ -173,12 +173,12 @@ def read_night_facts(
     )
 
 
-def look_first(objects: Sequence[NightObject]) -> list[NightObject]:
-    """Return the objects that are shown more closely: unsound ones first, then unknown ones."""
+def look_first(objects: Sequence[NightObject], limit: int = MAX_DETAILED) -> list[NightObject]:
+    """Return the objects that most need a look: unsound ones first, then unknown ones."""
     order = sorted(objects, key=lambda each: (
         each.verdict == ObjectVerdict.SOUND, each.status == NameStatus.KNOWN, -each.positions
     ))  # fmt: skip
-    return order[:MAX_DETAILED]
+    return order[:limit]
 
 
 def _concerned(

@@ -20,11 +20,12 @@ from epipole.tasks.report.html import (
     table,
     with_sigma,
 )
-from epipole.tasks.report.night_facts import NightFacts, percent
+from epipole.tasks.report.night_facts import NightFacts, look_first, percent
 from epipole.tasks.report.object_parts import detailed
 from epipole.tasks.report.objects import NightObject
 
 MAX_OBJECTS = 100
+MAX_DRAWN = 500  # in a picture: each has a mark and a text
 PICTURE_IN = 2.8
 
 
@@ -107,22 +108,32 @@ def objects(facts: NightFacts) -> Section:
     others = [each for each in found if each.has_orbit and not each.near_geostationary]
     pictures = []
     if ring:
+        drawn, some = _drawn(ring)
         pictures.append(figure(
-            as_svg(partial(draw_ring, objects=ring, anchors=facts.anchors), PICTURE_IN),
-            f"Longitude and latitude of {len(ring)} objects near the geostationary ring.",
+            as_svg(partial(draw_ring, objects=drawn, anchors=facts.anchors), PICTURE_IN),
+            f"Longitude and latitude of {len(drawn)} objects near the geostationary ring.",
             "Objects near the geostationary ring: from their first to their last position, which "
-            "has the marker. A station-kept one hardly moves.",
+            f"has the marker. A station-kept one hardly moves.{some}",
         ))  # fmt: skip
     if others:
+        drawn, some = _drawn(others)
         pictures.append(figure(
-            as_svg(partial(draw_elements, objects=others, anchors=facts.anchors), 3.6),
-            f"Semi-major axis, eccentricity and inclination of {len(others)} objects.",
+            as_svg(partial(draw_elements, objects=drawn, anchors=facts.anchors), 3.6),
+            f"Semi-major axis, eccentricity and inclination of {len(drawn)} objects.",
             "The other objects, by their orbits, with bars of one sigma. From a short arc, axis "
-            "and eccentricity are uncertain: their scatter is not that of orbits.",
+            f"and eccentricity are uncertain: their scatter is not that of orbits.{some}",
         ))  # fmt: skip
     body = beside(figures(pictures), paragraph(_names(found)) + _verdicts(found))
     body += _table(found, facts.anchors) + detailed(facts)
     return Section("objects", title, body)
+
+
+def _drawn(found: Sequence[NightObject]) -> tuple[list[NightObject], str]:
+    """Return the objects of a picture in the order of their ids, and a sentence if not all."""
+    if len(found) <= MAX_DRAWN:
+        return list(found), ""
+    drawn = sorted(look_first(found, MAX_DRAWN), key=lambda each: each.object_id)
+    return drawn, f" Drawn are {len(drawn)} of {len(found):,}, those that are not sound first."
 
 
 def _names(found: Sequence[NightObject]) -> str:

@@ -201,6 +201,22 @@ def test_hundreds_of_sensors_stay_within_a_megabyte():
     assert len(page.encode()) < 1_000_000
 
 
+def test_thousands_of_objects_stay_within_a_megabyte():
+    n = 8000
+    ids = [f"20190401-{k:05}" for k in range(n)]
+    radius_km = np.where(np.arange(n) < n // 2, 42164.0, 7000.0)
+    page = page_of(reader_of({
+        "objects": filled("objects", object_id=ids, verdict=["sound"] * (n - 1) + ["no_orbit"],
+                          n_sensors=[2] * n),
+        "orbits": filled("orbits", object_id=ids, x_km=radius_km, a_km=radius_km + np.arange(n),
+                         e=[0.001] * n, i_deg=[53.0] * n, sigma_a_km=[1.0] * n),
+    }))  # fmt: skip
+    assert page.count("Drawn are 500 of 4,000, those that are not sound first.") == 2
+    drawn = page[page.index("Semi-major axis, ecc") : page.index("The other objects, by")]
+    assert drawn.count(f'data-t="{ids[-1]}: ') == 2  # the one that is not sound, in both axes
+    assert len(page.encode()) < 1_000_000
+
+
 def test_the_extract_is_small_enough_for_an_artifact(night_dataset):
     extract = report_extract(read_night_facts(night_reader(night_dataset, NIGHT), "out"))
     assert len(extract.pictures) == 4
