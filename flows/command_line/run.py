@@ -108,6 +108,10 @@ def run(
     """
     if not verbose:
         warnings.simplefilter("ignore")
+    if stale and (night is not None or to is not None):
+        raise typer.BadParameter(
+            "it chooses the nights itself; leave --night and --to out", param_hint="--stale"
+        )
     dates = _dates(night, to, last_nights)
     early = _early_server(out, dates[-1], again)
     from epipole.flows.command_line.run_nightly import Nights, RunOptions

@@ -99,6 +99,7 @@ def test_a_night_that_fails_does_not_stop_the_next(night_run, night_log, monkeyp
         (["--to", NIGHT], "give the first night"),
         (["--night", NIGHT, "--to", "2019-03-31"], "is before"),
         (["--night", NIGHT, "--to", "tomorrow"], "is not a date"),
+        (["--night", NIGHT, "--stale"], "it chooses the nights"),
     ],
 )
 def test_a_range_that_is_none_is_refused(night_log, tmp_path, options, says):
