@@ -19,7 +19,8 @@ from epipole.tasks.algorithms.geometry.directions import (
 from epipole.tasks.algorithms.geometry.epipolar import epipolar_angle
 
 MAX_LINES = 12
-MAX_PAIRS = 3  # of sensors that are tried
+MAX_PAIRS = 12  # of sensors that are tried
+MIN_BASELINE_KM = 1.0  # from sensor to sensor: of nearer ones the lines are noise
 STEPS = 2000  # along a line
 POINTS = 12  # of a line that is drawn
 BEYOND = 1.05  # of the field: farther out a fitted distortion may fold the image
@@ -70,7 +71,8 @@ def read_epipolar_views(
 ) -> EpipolarViews | None:
     """Return an epoch's views of the two sensors that share the most objects.
 
-    None: it has no object that two sensors with calibrations saw.
+    None: it has no object that two sensors with calibrations saw, or these are on one satellite or
+    side by side.
     """
     cameras = _cameras(calibrations, sizes_px)
     columns = ["epoch", "object_id", "sensor_id", "frame_number", "x_px", "y_px", "epipolar_px",
@@ -82,6 +84,8 @@ def read_epipolar_views(
         names = shared["sensor_id"][0], shared["sensor_id_in"][0]
         poses = [_pose(night, name, cameras[name], epoch_ns) for name in names]
         if poses[0] is None or poses[1] is None:
+            continue
+        if np.linalg.norm(poses[0].r_km - poses[1].r_km) < MIN_BASELINE_KM:
             continue
         lines = _lines(night, shared.head(MAX_LINES), (poses[0], poses[1]), epoch_ns)
         return EpipolarViews(
