@@ -171,16 +171,19 @@ class _SeriesSums:
         failed = rows.filter(pl.col("status").is_not_null()).group_by("sensor_id", "status").len()
         for name, status, count in failed.iter_rows():
             self.failed[name, status] = self.failed.get((name, status), 0) + count
-        for k in np.unique(sensor).tolist():
-            self._find_gaps(k, time_ns[sensor == k])
+        order = np.argsort(sensor, kind="stable")
+        present, first = np.unique(sensor[order], return_index=True)
+        parts = np.split(time_ns[order], first[1:])
+        for k, of_sensor in zip(present.tolist(), parts, strict=False):
+            self._find_gaps(k, of_sensor)
 
-    def _find_gaps(self, k: int, time_ns: Indices) -> None:
+    def _find_gaps(self, k: int, time_ns: Indices, are_frames: bool = True) -> None:
         first = int(self.last_ns[k] < 0)
         before = self.bins.start_ns if first else self.last_ns[k]
         time_ns = np.concatenate([[before], time_ns])
         self.last_ns[k] = time_ns[-1]
         steps = np.diff(time_ns)
-        if not self.interval_ns[k] and len(inner := steps[first:]):
+        if are_frames and not self.interval_ns[k] and len(inner := steps[first:]):
             self.interval_ns[k] = np.median(inner)
         longest = max(GAP_FRAMES * self.interval_ns[k], SHORTEST_GAP_S * 1e9)
         for i in np.flatnonzero(steps > longest).tolist():
@@ -191,8 +194,9 @@ class _SeriesSums:
 
     def result(self) -> FrameSeries:
         """Return the series; a gap may last to the end of the night."""
+        end_ns = np.array([self.bins.end_ns - 1])
         for k in range(len(self.sensors)):
-            self._find_gaps(k, np.array([self.bins.end_ns - 1]))
+            self._find_gaps(k, end_ns, are_frames=False)
         with np.errstate(invalid="ignore", divide="ignore"):
             rms = {name: np.sqrt(self.squares[name] / self.numbers[name]) for name in SUMS}
             stars = self.stars / self.counts[0].sum(axis=1)

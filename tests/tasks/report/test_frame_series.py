@@ -48,6 +48,17 @@ def test_a_sensor_that_begins_late_and_stops_early_has_gaps_at_both_ends():
         assert series.lost_s.tolist() == [0, 50]
 
 
+def test_a_sensor_with_one_frame_has_gaps_before_and_after_it():
+    time = seconds(100)
+    of_sensor = ["a"] * 20 + ["b"] + ["a"] * 80
+    frames = filled("frames", time=[*time[:21], *time[20:]], sensor_id=of_sensor,
+                    attitude_source=["none"] * 101)  # fmt: skip
+    for in_group in (7, 1000):
+        series = read_frame_series(reader_of({"frames": frames}, in_group=in_group))
+        assert [(gap.sensor_id, gap.seconds) for gap in series.gaps] == [("b", 20), ("b", 79)]
+        assert series.lost_s.tolist() == [0, 99]
+
+
 def test_sigmas_are_root_mean_squares():
     series = read_frame_series(night())
     assert np.nanmax(abs(series.rms["across"] - np.sqrt(12.5))) < 1e-12
