@@ -8,7 +8,7 @@ import polars as pl
 
 from epipole.flows.api.arguments import Time, floats, nanoseconds, time_ns
 from epipole.schemas.arrays import Array, Flags
-from epipole.schemas.columns import ELEMENTS
+from epipole.schemas.columns import ELEMENTS, POSITION
 from epipole.schemas.settings import Settings
 from epipole.tasks.algorithms.constants import ARCSEC, SECOND_NS
 from epipole.tasks.algorithms.geometry.covariances import centroid_covariance
@@ -36,7 +36,10 @@ from epipole.tasks.publish.object_orbits import (
 )
 
 NS = "datetime64[ns]"
-_NUMBERS = ["ra_deg", "dec_deg", "sigma_ra_arcsec", "sigma_dec_arcsec", "correlation"]
+_SIGMAS = ["sigma_ra_arcsec", "sigma_dec_arcsec"]
+# Of each row that is fitted.
+_NUMBERS = ["ra_deg", "dec_deg", *_SIGMAS, "correlation", "bias_sigma_arcsec", *POSITION,
+            "position_sigma_km"]  # fmt: skip
 
 
 class Attributable(NamedTuple):
@@ -80,7 +83,7 @@ class ObjectOrbit(NamedTuple):
         Weighted sum of squares, and its degrees of freedom.
     used : (n,) bool
         Which observations were fitted, in the order of the rows; false: of something else, or
-        without a direction and its error.
+        without one of the numbers of direction, sensor position and their errors.
     forces : str
         As in the table `orbits`.
     elements : dict of str to float
@@ -255,7 +258,7 @@ def fit_orbit(observations: pl.DataFrame, start: npt.ArrayLike | None = None) ->
     Raises
     ------
     ValueError
-        Where a column is missing, or there are no rows.
+        Where a column is missing, there are no rows, a sigma is 0, or `start` is not a state.
 
     Examples
     --------
@@ -282,11 +285,14 @@ def fit_orbit(observations: pl.DataFrame, start: npt.ArrayLike | None = None) ->
     rows = rows.filter(pl.all_horizontal(pl.col(_NUMBERS).cast(pl.Float64).is_finite()))
     if not len(rows):
         raise ValueError(f"observations: no row has all of {', '.join(_NUMBERS)}")
+    for name in _SIGMAS:
+        if wrong := int((rows[name] <= 0).sum()):
+            raise ValueError(f"observations: {name} is not above 0 in {wrong} of {len(rows)} rows")
     times = rows["time"].cast(pl.Int64).to_numpy()
     middle_ns = (int(times[0]) + int(times[-1])) // 2
     night = str(np.datetime64(middle_ns, "ns").astype("datetime64[D]"))
     around, origin_ns = surroundings_of(night), noon_ns(night)
-    begin = None if start is None else Start(middle_ns, floats("start", start, 6))
+    begin = None if start is None else Start(middle_ns, _state("start", start))
     directions = observed_objects(rows, origin_ns, around).directions(0)
     fitted = best_orbit(directions, begin, origin_ns, around)
     epoch, verdict = np.datetime64(middle_ns, "ns"), judge(fitted)
@@ -304,3 +310,11 @@ def fit_orbit(observations: pl.DataFrame, start: npt.ArrayLike | None = None) ->
         epoch, state, turn @ fitted.orbit.cov[:6, :6] @ turn.T, float(fitted.orbit.chi2),
         fitted.dof, used, fitted.forces, dict(zip(ELEMENTS, values.tolist(), strict=True)), reason,
     )  # fmt: skip
+
+
+def _state(name: str, values: npt.ArrayLike) -> Array:
+    """Return a state (6,) [km, km/s], as an orbit can begin with it."""
+    state = floats(name, values, 6)
+    if not np.isfinite(state).all() or not np.linalg.norm(state[:3]):
+        raise ValueError(f"{name}: {state.tolist()} is not a position [km] and a velocity [km/s]")
+    return state

@@ -114,6 +114,24 @@ def test_a_row_without_a_direction_is_not_fitted():
         api.fit_orbit(rows.with_columns(ra_deg=pl.lit(None, pl.Float64)))
 
 
+@pytest.mark.parametrize("column", ["x_km", "position_sigma_km", "bias_sigma_arcsec"])
+def test_a_row_without_a_sensor_position_or_its_error_is_not_fitted(column):
+    rows = observations(GEO).with_row_index("n")
+    gone = rows.with_columns(pl.when(pl.col("n") != 5).then(column).alias(column))
+    orbit = api.fit_orbit(gone)
+    assert orbit.verdict is None
+    assert np.flatnonzero(~orbit.used).tolist() == [5]
+
+
+def test_numbers_that_no_fit_can_take_are_named():
+    rows = observations(GEO)
+    with pytest.raises(ValueError, match=f"sigma_dec_arcsec is not above 0 in {len(rows)} of"):
+        api.fit_orbit(rows.with_columns(sigma_dec_arcsec=pl.lit(0.0)))
+    for start in (np.zeros(6), [np.nan] * 6):
+        with pytest.raises(ValueError, match=r"start: .* is not a position \[km\] and a velocity"):
+            api.fit_orbit(rows, start)
+
+
 def test_too_few_rows_give_no_orbit():
     orbit = api.fit_orbit(observations(GEO).head(3))
     assert orbit.verdict == "no_orbit"
