@@ -204,6 +204,7 @@ def _concerned(
 MIN_IDENTIFIED = 0.9  # share of a sensor's frames
 # A mean square over what it should be: sigmas are a fifth too large, or too small.
 LOWEST, HIGHEST = 0.7, 1.4
+SMALLEST = 1e-3  # ratio that is said: of a log without noise the residuals are 0
 MIN_VALUES = 30  # independent values: with fewer, noise alone exceeds the bounds
 MIN_NIGHTS = 5
 DROP = 0.7  # of the median of the nights before
@@ -300,7 +301,7 @@ def holds(mean_square: float) -> bool:
 
 
 def _off(mean_square: float) -> str:
-    ratio = float(np.sqrt(mean_square))
+    ratio = max(float(np.sqrt(mean_square)), SMALLEST)
     return f"{ratio:.2f} times larger" if ratio > 1 else f"{1 / ratio:.2f} times smaller"
 
 

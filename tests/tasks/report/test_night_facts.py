@@ -60,6 +60,14 @@ def test_a_sensor_at_fault_stands_first():
     assert share.anchor == "frame-1"
 
 
+def test_residuals_of_zero_need_a_look():
+    n = 40
+    pairs = filled("pairs", epoch=seconds(n), mahalanobis=[0.0] * n)
+    looks = needs_look(read_night_facts(reader_of({"pairs": pairs}), "out"))
+    says = "Sigmas of pair distances do not hold: the residuals are 1000.00 times smaller."
+    assert says in [look.sentence for look in looks]
+
+
 def test_the_frame_concerned_is_one_that_is_not_identified():
     facts = read_night_facts(hostile_night("s1"), "out")
     (frame,) = facts.concerned.values()
