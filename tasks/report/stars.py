@@ -7,6 +7,7 @@ import polars as pl
 
 from epipole.io.datasets.night_tables import NightReader
 from epipole.schemas.arrays import Array, Flags, Indices
+from epipole.schemas.log_checks import LogCheck
 from epipole.tasks.algorithms.constants import ARCSEC
 from epipole.tasks.report.frame_series import FrameSeries, codes
 
@@ -54,14 +55,24 @@ def read_star_residuals(
 
     Notes
     -----
-    A star has no sigma in the tables: that of the sensor's detections is used, their
-    median. The fit of the attitude takes 3 of the 2 n degrees of freedom of n stars.
+    A star has no sigma in the tables. That of the sensor is used: the rms of what the log states
+    for its stars (`checks`), else the median of its detections, which are as bright as they happen
+    to be. The fit of the attitude takes 3 of the 2 n degrees of freedom of n stars.
     """
-    sigma_px = _sigmas_px(night, sensors, calibrations)
+    stated_px = _stated_px(night, sensors)
+    sigma_px = np.where(np.isfinite(stated_px), stated_px, _sigmas_px(night, sensors, calibrations))
     sums = _ResidualSums(sensors, sigma_px, _sizes(night, sensors))
     for rows in night.pieces("stars", COLUMNS):
         sums.add(rows)
     return sums.result() if sums.stars.sum() else None
+
+
+def _stated_px(night: NightReader, sensors: list[str]) -> Array:
+    """Return the stated sigma of each sensor's stars; NaN where the stars were not compared."""
+    rows = night.read("checks", ["sensor_id", "check", "expected"])
+    compared = rows.filter(pl.col("check") == LogCheck.CENTROID_SIGMA.value)
+    of = dict(compared.select("sensor_id", "expected").drop_nulls().iter_rows())
+    return np.array([of.get(name, np.nan) for name in sensors])
 
 
 def _sigmas_px(night: NightReader, sensors: list[str], calibrations: pl.DataFrame) -> Array:

@@ -18,7 +18,7 @@ from epipole.tasks.report.stars import (
 SIGMA_PX, FOCAL_PX, STARS = 0.1, 1000.0, 20
 
 
-def night(n_frames, pattern_px=0.0, seed=1):
+def night(n_frames, pattern_px=0.0, seed=1, of_objects=1.0, **tables):
     rng = np.random.default_rng(seed)
     n = n_frames * STARS
     frame = np.repeat(np.arange(n_frames), STARS)
@@ -28,8 +28,8 @@ def night(n_frames, pattern_px=0.0, seed=1):
     stars = filled("stars", sensor_id=np.full(n, "a"), time=START_NS + frame * 10**8,
                    frame_number=frame, x_px=x, y_px=y, dx_px=noise[0] + pattern_px * (x / 256 - 1),
                    dy_px=noise[1])  # fmt: skip
-    sigma = [SIGMA_PX / FOCAL_PX / ARCSEC] * 9
-    tables = {
+    sigma = [of_objects * SIGMA_PX / FOCAL_PX / ARCSEC] * 9
+    tables |= {
         "stars": stars,
         "detections": filled("detections", sensor_id=["a"] * 9, sigma_arcsec=sigma),
         "calibrations": filled("calibrations", sensor_id=["a"], fx_px=[FOCAL_PX], fy_px=[FOCAL_PX]),
@@ -49,6 +49,13 @@ def test_noise_of_the_told_sigma_has_a_mean_square_of_one():
     middle = (HISTOGRAM[1:] + HISTOGRAM[:-1]) / 2
     normal = np.exp(-(middle**2) / 2) / np.sqrt(2 * np.pi) * np.diff(HISTOGRAM)
     assert abs(share - normal).max() < 0.003
+
+
+def test_sigmas_that_the_log_states_for_stars_count_more_than_those_of_detections():
+    # Objects are brighter than the stars: their sigma is half as large.
+    stated = filled("checks", sensor_id=["a"], check=["centroid_sigma"], expected=[SIGMA_PX])
+    assert abs(found(night(500, of_objects=0.5)).mean_square[0] - 4) < 0.2
+    assert abs(found(night(500, of_objects=0.5, checks=stated)).mean_square[0] - 1) < 0.05
 
 
 def test_a_pattern_over_the_image_is_found():
