@@ -1,10 +1,11 @@
 """Assume readings: what the settings say of logs that were written otherwise than they state."""
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 import pyarrow as pa
 
+from epipole.io.logs.left_out import log_time_range
 from epipole.io.logs.messages.encoding import StateMessage
 from epipole.schemas.arrays import Array, Flags, Nanoseconds
 from epipole.schemas.bridge import array
@@ -64,21 +65,23 @@ def in_kilometres(
 
 
 def as_assumed_source(
-    source: LogSource, sensors: Iterable[str], assumptions: Sequence[Assumption]
+    source: LogSource,
+    frames_ns: Sequence[Nanoseconds],
+    states_ns: Sequence[Nanoseconds],
+    assumptions: Sequence[Assumption],
 ) -> LogSource:
-    """Return the source with the time range of these sensors as they are read."""
-    if source.first_time_ns is None or source.last_time_ns is None or not assumptions:
+    """Return the source with its time range as its frames, or its states, are read.
+
+    Parameters
+    ----------
+    frames_ns, states_ns
+        Times of all frames and states of the log, as `as_assumed` has them. By how much a frame
+        moves depends on its sensor and its exposure.
+    """
+    if not assumptions:
         return source
-    written = np.array([source.first_time_ns, source.last_time_ns])
-    ends = [written]
-    for sensor in sensors:
-        moved = written
-        for assumed in assumptions:
-            if assumed.sensor in (sensor, EVERY_SENSOR):
-                moved = moved - _ahead_ns(moved, assumed) - _in_ns(assumed.frames_ahead_s)
-        ends.append(moved)
-    first, last = np.array(ends[1:] or ends).T
-    return source._replace(first_time_ns=int(first.min()), last_time_ns=int(last.max()))
+    first, last = log_time_range(frames_ns) or log_time_range(states_ns) or (None, None)
+    return source._replace(first_time_ns=first, last_time_ns=last)
 
 
 def _ahead_ns(time_ns: Nanoseconds, assumed: Assumption) -> Nanoseconds:

@@ -10,6 +10,8 @@ import pyarrow.compute as pc
 from epipole.io.logs.reader import read_log_pieces
 from epipole.io.work.parts import LOG_PIECE, write_part
 from epipole.io.work.work_layout import ReadFolder
+from epipole.schemas.arrays import Nanoseconds
+from epipole.schemas.bridge import array
 from epipole.schemas.settings import Assumption
 from epipole.schemas.stages import Stage
 from epipole.schemas.work_tables import LogSource
@@ -75,18 +77,14 @@ def read_log_into(
         If it is not a log; see `read_log_pieces`.
     """
     n_pieces, n_cameras, source = 0, 0, None
+    times_ns: tuple[list[Nanoseconds], list[Nanoseconds]] = [], []  # of frames, of states
     sensors: dict[str, SensorInLog] = {}
     for written in read_log_pieces(path, as_meant=in_kilometres(assumptions)):
         piece = as_assumed(written, assumptions)
         write_part(
             folder.piece(number, n_pieces),
             LOG_PIECE,
-            {
-                "exposures": piece.exposures,
-                "states": piece.states,
-                "cameras": piece.cameras,
-                "rejects": piece.rejects,
-            },
+            {name: getattr(piece, name) for name in LOG_PIECE},
             within=folder.root,
         )
         for sensor_id, n_frames in _frames_of(piece.exposures, piece.states).items():
@@ -95,8 +93,11 @@ def read_log_into(
         n_pieces += 1
         n_cameras += piece.cameras.num_rows
         source = piece.source or source
+        if assumptions:
+            times_ns[0].append(array(piece.exposures, "time"))
+            times_ns[1].append(array(piece.states, "time"))
     assert source is not None, "the last piece has it"
-    source = as_assumed_source(source, sensors, assumptions)
+    source = as_assumed_source(source, *times_ns, assumptions)
     n_frames = sum(found.n_frames for found in sensors.values())
     LOGGER.debug("%s: read %d frames in %d pieces", source.name, n_frames, n_pieces)
     return ReadLog(number, n_pieces, source, sensors, n_cameras)

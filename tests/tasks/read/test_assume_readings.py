@@ -8,6 +8,8 @@ import pytest
 
 from epipole.io.logs.messages.encoding import StateMessage
 from epipole.io.logs.reader import read_log_pieces
+from epipole.io.logs.writer import LogWriter
+from epipole.io.work.work_layout import ReadFolder
 from epipole.schemas.bridge import array
 from epipole.schemas.errors import SettingsError
 from epipole.schemas.given_settings import with_assumptions
@@ -19,9 +21,12 @@ from epipole.tasks.read.assume_readings import (
     in_kilometres,
     without_velocities,
 )
+from epipole.tasks.read.order_frames import frame_times, order_logs
+from epipole.tasks.read.read_logs import read_log_into
 
 EXAMPLE = Path(__file__).parents[3] / "examples" / "four_sensor_geo.mcap"
 SENSORS = ("sat1", "sat2", "sat3", "sat4")
+START_NS = 1_554_091_200_000_000_000
 
 
 @pytest.fixture(scope="module")
@@ -48,6 +53,11 @@ def later(piece, by_s, *sensors):
     )
 
 
+def times_of(piece):
+    """The times of the frames and of the states of a piece."""
+    return [array(piece.exposures, "time")], [array(piece.states, "time")]
+
+
 @pytest.mark.parametrize(
     ("by_s", "assumed"),
     [
@@ -59,8 +69,9 @@ def later(piece, by_s, *sensors):
 )
 def test_times_of_all_sensors_are_taken_back(piece, by_s, assumed):
     wrong, assumptions = later(piece, by_s, *SENSORS), [Assumption(**assumed)]
-    source = as_assumed_source(wrong.source, SENSORS, assumptions)
-    assert as_assumed(wrong, assumptions)._replace(source=source) == piece
+    found = as_assumed(wrong, assumptions)
+    source = as_assumed_source(wrong.source, *times_of(found), assumptions)
+    assert found._replace(source=source) == piece
 
 
 def test_times_of_one_sensor_are_taken_back_and_no_frame_is_outside_the_log(piece):
@@ -69,7 +80,7 @@ def test_times_of_one_sensor_are_taken_back_and_no_frame_is_outside_the_log(piec
     found = as_assumed(wrong, gps)
     assert (found.exposures, found.states) == (piece.exposures, piece.states)
     time_ns = array(found.exposures, "time")
-    source = as_assumed_source(wrong.source, SENSORS, gps)
+    source = as_assumed_source(wrong.source, *times_of(found), gps)
     assert source.first_time_ns <= time_ns.min() <= time_ns.max() <= source.last_time_ns
 
 
@@ -104,6 +115,22 @@ def test_the_middle_of_exposures_is_found_from_their_ends(piece, instant, earlie
     at_ends = rows.set_column(index, field, pa.array(written).cast(field.type))
     found = as_assumed(piece._replace(exposures=at_ends), [Assumption(frame_time=instant)])
     assert np.abs(array(found.exposures, "time") - array(rows, "time")).max() <= 1
+
+
+@pytest.mark.parametrize("instant", ["start", "end"])
+def test_no_frame_is_a_stray_because_its_exposure_is_long(instant, tmp_path):
+    with LogWriter(tmp_path / "a.mcap") as log:
+        for k, exposure_s in enumerate([4.0, 1.0, 4.0]):
+            time_ns = START_NS + k * 1_000_000_000
+            log.frame("s", time_ns, frame_number=k, exposure_s=exposure_s, x_px=[], y_px=[])
+    folder, assumed = ReadFolder(tmp_path), [Assumption(frame_time=instant)]
+    read = read_log_into(folder, 0, str(tmp_path / "a.mcap"), assumed)
+    frames = order_logs(folder, [read], Settings().sensors)
+    assert frames.rejects.num_rows == 0
+    time_ns = frame_times(folder, 0)
+    assert len(time_ns) == 3
+    ends = read.source.first_time_ns, read.source.last_time_ns
+    assert ends == (time_ns[0], time_ns[-1])
 
 
 def metres(state, *sensors):
@@ -145,7 +172,8 @@ def test_what_nobody_assumes_stays(piece):
     assert as_assumed(piece, [Assumption(sensor="sat9", time="gps", states="ITRF")]) == piece
     assert as_assumed(piece, ()) is piece
     gps = [Assumption(sensor="sat9", time="gps")]
-    assert as_assumed_source(piece.source, SENSORS, gps) == piece.source
+    assert as_assumed_source(piece.source, *times_of(piece), gps) == piece.source
+    assert as_assumed_source(piece.source, [], [], ()) is piece.source
 
 
 def test_assumptions_of_a_command_join_those_of_the_settings():
