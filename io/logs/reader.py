@@ -41,7 +41,7 @@ PER_MESSAGE = ("channel", "time_ns", "start", "end", "offset")  # columns of a b
 THREADS = 2  # that decompress and check chunks, in addition to the one that decodes
 MAX_WARNINGS = 20  # of unknown encodings in one log: it may have 65,536 channels
 LONGEST_NAME = 80  # of a topic or an encoding in a message
-PIECE_BYTES = 64 << 20  # of frames and states in one piece of a log
+PIECE_BYTES = 64 << 20  # of frames, states and calibrations in one piece of a log
 
 
 def read_log(path: str | os.PathLike[str]) -> LogContents:
@@ -84,10 +84,10 @@ def read_log_pieces(
 ) -> Iterator[LogPiece]:
     """Yield what `read_log` returns in pieces, so that a log need not fit into memory.
 
-    A piece has about `piece_bytes` of frames and states, at most one chunk of the log more. Each
-    message comes once, in the order of the file. There is at least one piece. The last one has
-    the rejects and the source, with the log's time range: frames outside it are strays.
-    `as_meant` returns a state that was written otherwise than it should be as it was meant.
+    A piece has about `piece_bytes` of frames, states and calibrations, at most one chunk of the
+    log more. Each message comes once, in the order of the file. There is at least one piece. The
+    last one has the rejects and the source, with the log's time range: frames outside it are
+    strays. `as_meant` returns a state that was written otherwise than it should be as it was meant.
     """
     where = known_as(os.fspath(path))
     with open_mcap(where) as data, ThreadPoolExecutor(THREADS, "open chunks") as pool:
@@ -133,7 +133,7 @@ class _Reading:
     @property
     def n_bytes(self) -> int:
         """The size of the rows that have not been taken."""
-        return self._frames.n_bytes + self._states.n_bytes
+        return sum(columns.n_bytes for columns in self.columns.values())
 
     def piece(self) -> LogPiece:
         """Return the rows since the last piece."""

@@ -156,8 +156,7 @@ def ordered_logs(
     """Return the frames of all sensors of the plan, which `order_sensors` has ordered."""
     parts = [plan.folder.piece(log.number, k) for log in plan.logs for k in range(log.n_pieces)]
     cameras = with_uncertain_principal_points(
-        _sorted_cameras(_piece_tables(parts, "cameras", CAMERAS)),
-        settings.principal_point_sigma_px or 0.0,
+        _sorted_cameras(parts), settings.principal_point_sigma_px or 0.0
     )
     rejects = [_piece_tables(parts, "rejects", REJECTS)]
     rejects += [rows for of_kind in zip(*(each.rejects for each in ordered), strict=True)
@@ -354,14 +353,28 @@ def _sorted_states(
     return states_to_gcrf(rows.take(pa.array(order[~repeats])), settings.position_sigma_km), rejects
 
 
-def _sorted_cameras(cameras: pa.Table) -> pa.Table:
+def _sorted_cameras(parts: Sequence[Path]) -> pa.Table:
     """Return the calibrations sorted by sensor and time, without those that repeat the one before.
 
-    Each log of a sensor states its calibration again.
+    Each log of a sensor states its calibration again, and a recorder may with each frame. So all
+    of them are in memory only of sensors that have several different ones.
     """
-    rows = to_polars(cameras.sort_by([(name, "ascending") for name in CAMERAS.names]))
+    pieces = [_first_of_each(to_polars(read_part(part, "cameras"))) for part in parts]
+    different = _first_of_each(pl.concat([to_polars(CAMERAS.empty_table()), *pieces]))
+    changing = different.filter(pl.col("sensor_id").is_duplicated())["sensor_id"].unique()
+    again = [
+        to_polars(read_part(part, "cameras")).filter(pl.col("sensor_id").is_in(changing.implode()))
+        for part in (parts if len(changing) else ())
+    ]
+    rows = pl.concat([different, *again]).sort(CAMERAS.names)
     run = pl.struct(pl.exclude("time")).rle_id()
     return from_polars(CAMERAS, rows.filter(run.is_first_distinct()))
+
+
+def _first_of_each(cameras: pl.DataFrame) -> pl.DataFrame:
+    """Return the earliest of equal calibrations: rows of CAMERAS, in any order."""
+    optics = [name for name in CAMERAS.names if name != "time"]
+    return cameras.group_by(optics).agg(pl.col("time").min()).select(CAMERAS.names)
 
 
 def with_uncertain_principal_points(cameras: pa.Table, sigma_px: float) -> pa.Table:

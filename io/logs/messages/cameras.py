@@ -33,6 +33,7 @@ TERMS = ("k1", "k2", "p1", "p2", "k3", "k4")
 # that far.
 FARTHEST_UNDISTORTED = 4.0
 FOLD_STEPS, FOLD_DIRECTIONS = 400, 32
+ROW_BYTES = 1000  # about, of a calibration that waits
 
 
 @dataclass
@@ -59,6 +60,11 @@ class CameraColumns:
                     offset=offset,
                     sensor_id=known_id(calibration.sensor_id),
                 )
+
+    @property
+    def n_bytes(self) -> int:
+        """About the size of the rows that have not been taken."""
+        return len(self._rows) * ROW_BYTES
 
     def take(self) -> pa.Table:
         """Return CAMERAS of the calibrations since the last call."""

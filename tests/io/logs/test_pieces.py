@@ -60,6 +60,18 @@ def test_a_piece_is_at_most_a_chunk_larger_than_asked_for(log):
     assert all(40_000 < size < 60_000 for size in sizes[:-1])
 
 
+def test_calibrations_are_read_in_pieces_too(tmp_path):
+    names = ("width", "height", "fx_px", "fy_px", "cx_px", "cy_px")
+    camera = dict(zip(names, (100, 100, 500.0, 500.0, 50.0, 50.0), strict=True))
+    camera |= dict.fromkeys(("k1", "k2", "p1", "p2", "k3"), 0.0)
+    with LogWriter(tmp_path / "a.mcap", chunk_size=4000) as out:
+        for k in range(1000):
+            out.camera("sat1", START_NS + k, camera)
+    pieces = list(read_log_pieces(tmp_path / "a.mcap", piece_bytes=100_000))
+    assert sum(piece.cameras.num_rows for piece in pieces) == 1000
+    assert max(piece.cameras.nbytes for piece in pieces) < 120_000
+
+
 def test_a_log_without_frames_has_the_times_of_its_states(tmp_path):
     with LogWriter(tmp_path / "a.mcap") as out:
         out.state("sat1", START_NS, position_km=[7000.0, 0.0, 2.0])

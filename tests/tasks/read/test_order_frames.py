@@ -1,6 +1,7 @@
 """Order frames: those of several logs together, each once, whatever the order of the logs."""
 
 import logging
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -8,8 +9,13 @@ import pytest
 from scenes.whole_logs import read_whole
 
 from epipole.io.logs.writer import LogWriter
-from epipole.schemas.bridge import array, stack
+from epipole.io.work.parts import LOG_PIECE, write_part
+from epipole.io.work.work_layout import ReadFolder
+from epipole.schemas.bridge import array, stack, table
 from epipole.schemas.settings import Settings
+from epipole.schemas.work_tables import CAMERAS, LogSource
+from epipole.tasks.read.order_frames import OrderPlan, ordered_logs
+from epipole.tasks.read.read_logs import ReadLog
 
 START_NS = 1_554_091_200_000_000_000
 SECOND_NS = 1_000_000_000
@@ -170,6 +176,30 @@ def test_a_calibration_that_comes_back_counts_again(tmp_path):
     assert array(found, "sensor_id").tolist() == ["r", "s", "s", "s"]
     assert (array(found, "time") - START_NS).tolist() == [0, 0, 2, 4]
     assert array(found, "fx_px").tolist() == [500.0, 500.0, 510.0, 500.0]
+
+
+def resident_mib(of):
+    """The resident memory of this process: `VmRSS` now, `VmHWM` at most so far."""
+    return int(Path("/proc/self/status").read_text().split(f"{of}:")[1].split()[0]) / 1024
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="asks Linux for the memory")
+def test_calibrations_with_each_frame_do_not_add_up_in_memory(tmp_path):
+    folder, n = ReadFolder(tmp_path), 20_000
+    sensors = np.repeat(["r", "s"], n // 2)
+    columns = {name: np.zeros(n, int if name == "width" else float) for name in CAMERAS.names}
+    columns |= {"sensor_id": sensors, "height": np.zeros(n, int), "fisheye": np.zeros(n, bool)}
+    empty = {name: schema.empty_table() for name, schema in LOG_PIECE.items()}
+    for k in range(20):  # altogether 200 MB
+        columns["time"] = START_NS + k * n + np.arange(n)
+        write_part(folder.piece(0, k), LOG_PIECE, empty | {"cameras": table(CAMERAS, columns)})
+    log = ReadLog(0, 20, LogSource("a.mcap", 1, "", None, None), {}, 20 * n)
+    before = resident_mib("VmRSS")
+    Path("/proc/self/clear_refs").write_text("5")  # the peak so far is forgotten
+    found = ordered_logs(OrderPlan(folder, [log], []), [], Settings().sensors).cameras
+    assert resident_mib("VmHWM") - before < 100
+    assert found["sensor_id"].to_pylist() == ["r", "s"]
+    assert (array(found, "time") - START_NS).tolist() == [0, n // 2]
 
 
 def test_states_are_converted_to_gcrf(tmp_path):
