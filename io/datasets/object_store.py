@@ -343,12 +343,11 @@ class StoreNights:
         try:
             self._each(self._storage.put_file, moves)
             self.locks.verify(nights)
-            text = json.dumps({"staged": f"run-{token}", "files": files})
-            self._storage.pipe_file(commit.path, text.encode())
         except BaseException:
             with contextlib.suppress(Exception):  # a later run clears what is left
                 self._storage.rm(run, recursive=True)
             raise
+        self._write_commit(commit)
         try:
             self._finish(commit)
         except storage_errors() as error:
@@ -356,6 +355,22 @@ class StoreNights:
                 f"{self._dataset}: {', '.join(nights)} published, but not all files are in place "
                 f"({line_of(error)}); run again to finish this"
             ) from error
+
+    def _write_commit(self, commit: Commit) -> None:
+        """Write the object that publishes the nights, or nothing.
+
+        A store may have written it though its answer is an error, or never came. Then it is
+        removed. The staged files stay: if it cannot be removed either, the next run finishes it,
+        else it clears them.
+        """
+        staged = commit.staged.rpartition("/")[2]
+        text = json.dumps({"staged": staged, "files": commit.files})
+        try:
+            self._storage.pipe_file(commit.path, text.encode())
+        except BaseException:
+            with contextlib.suppress(Exception):  # most often it is not there
+                self._storage.rm_file(commit.path)
+            raise
 
     def recover(self) -> None:
         """Finish the commits of killed runs, except on nights that another run has locked.

@@ -222,6 +222,37 @@ def test_a_store_that_refuses_a_write_ends_in_one_line_and_no_half_night(
     assert [p for p in s3.find(out) if "/.staging/" in p] == []
 
 
+@pytest.mark.parametrize("can_remove", [True, False])
+def test_a_commit_that_is_written_though_the_store_says_not_leaves_no_broken_night(
+    s3, out, can_remove, monkeypatch
+):
+    publish_once(out, night_tables(TIMES[:8]), [NIGHT])
+    storage = store_nights(out)._storage
+    pipe_file, rm_file = storage.pipe_file, storage.rm_file
+
+    def lose_answer(path, *arguments, **named):
+        pipe_file(path, *arguments, **named)
+        if "/commit-" in path:
+            raise ConnectionResetError("no answer came")
+
+    def refuse(path):
+        if not can_remove and "/commit-" in path:
+            raise ConnectionResetError("no answer came")
+        rm_file(path)
+
+    with monkeypatch.context() as patched:
+        patched.setattr(storage, "pipe_file", lose_answer)
+        patched.setattr(storage, "rm_file", refuse)
+        with pytest.raises(DatasetError, match="no answer came"):
+            publish_once(out, night_tables(TIMES), [NIGHT])
+    found = read_table(out, "frames", NIGHT).num_rows
+    assert found == (8 if can_remove else len(TIMES))
+    assert counts(out)["positions"] == found
+    publish_once(out, night_tables(TIMES), [NEXT_NIGHT])
+    assert read_table(out, "frames", NIGHT).num_rows == found
+    assert [p for p in s3.find(out) if "/.staging/" in p] == []
+
+
 def test_a_second_run_of_a_night_is_refused_and_names_the_first(s3, out):
     with lock_nights(out, [NIGHT, NEXT_NIGHT]):
         other = LockRecord(["2019-04-05"], "far", 7, "2026-01-01T00:00:00Z", "", "t")
