@@ -380,7 +380,10 @@ class StoreNights:
         for commit in self._commits():
             others = self.locks.missing(list(commit.files))
             with contextlib.suppress(DatasetError), self.locks.lock(others):
-                self._finish(commit)  # else the run that locked them will
+                self._storage.invalidate_cache()
+                if self._storage.exists(commit.path):  # else another run has just finished it
+                    self._finish(commit)
+                # Where they are locked, the run that locked them will finish it.
         # A run locks, then stages, then commits. So a staged folder that is listed first, and then
         # has neither a lock nor a commit, belongs to a run that has ended.
         runs = [entry.rstrip("/") for entry in self._ls(f"{self._root}/{STAGING}")]
@@ -389,7 +392,8 @@ class StoreNights:
         for run in runs:
             name = run.rpartition("/")[2]
             if name.startswith("run-") and name not in used:
-                self._storage.rm(run, recursive=True)
+                with contextlib.suppress(FileNotFoundError):  # another run has just removed it
+                    self._storage.rm(run, recursive=True)
 
     def _finish(self, commit: Commit) -> None:
         """Copy the committed files into place, and remove the commit."""

@@ -253,6 +253,29 @@ def test_a_commit_that_is_written_though_the_store_says_not_leaves_no_broken_nig
     assert [p for p in s3.find(out) if "/.staging/" in p] == []
 
 
+def test_what_another_run_has_finished_or_cleared_meanwhile_stops_nothing(s3, out, monkeypatch):
+    store = store_nights(out)
+    with monkeypatch.context() as patched:
+        patched.setattr(store, "_finish", lambda commit: None)
+        publish_once(out, night_tables(TIMES), [NIGHT])
+    s3.pipe_file(f"{out}/.staging/run-{'0' * 32}/night={NIGHT}/frames/part-0.parquet", b"")
+    staging = f"{store._root}/.staging"
+    commits, listed = store._commits(), list(store._ls(staging))
+    store.recover()  # as another run does, after this one has listed what is there
+    assert s3.find(staging) == []
+    find_commits, ls, alive = store._commits, store._ls, store.locks.alive
+
+    def alive_later():
+        commits.clear()
+        return alive()
+
+    monkeypatch.setattr(store, "_commits", lambda: commits.copy() or find_commits())
+    monkeypatch.setattr(store, "_ls", lambda where: iter(listed) if where == staging else ls(where))
+    monkeypatch.setattr(store.locks, "alive", alive_later)
+    publish_once(out, night_tables(TIMES[:5]), [NEXT_NIGHT])
+    assert nights_in(out) == [NIGHT, NEXT_NIGHT]
+
+
 def test_a_second_run_of_a_night_is_refused_and_names_the_first(s3, out):
     with lock_nights(out, [NIGHT, NEXT_NIGHT]):
         other = LockRecord(["2019-04-05"], "far", 7, "2026-01-01T00:00:00Z", "", "t")
