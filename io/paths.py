@@ -70,12 +70,13 @@ def file_system(where: str) -> tuple[Any, str]:
 def open_remote(where: str) -> tuple[int, Callable[[int, int], bytes], Callable[[], None]]:
     """Return the size of the file behind a URL, and two functions: read a range, and check it.
 
-    The check raises where the file has changed since it was opened.
+    The check raises where the file has changed since it was opened, if its store has versions of
+    files. HTTP has no versions.
 
     Raises
     ------
     LogError
-        Where the file is missing or cannot be read.
+        Where the file is missing or cannot be read, or its server has no ranges of it.
     """
     where = known_as(where)
     with _as_log_errors(where):
@@ -86,12 +87,21 @@ def open_remote(where: str) -> tuple[int, Callable[[int, int], bytes], Callable[
         raise LogError(
             f"{where}: is a folder; give the logs in it by a glob pattern, such as {where}/*.mcap"
         )
+    if info["size"] is None:
+        raise LogError(
+            f"{where}: its server does not tell how large it is; copy the file and give that"
+        )
 
     def read(start: int, end: int) -> bytes:
         if start >= end:
             return b""
         with _as_log_errors(where):
             data: bytes = storage.cat_file(path, start=start, end=end)
+        if len(data) > end - start:
+            raise LogError(
+                f"{where}: its server sends more than the range that is asked for; "
+                "copy the file and give that"
+            )
         return data
 
     def check() -> None:

@@ -1,8 +1,12 @@
 """Logs in memory and in a bucket of an S3 server that the tests start."""
 
+import functools
 import hashlib
+import http.server
 import os
 import random
+import threading
+from pathlib import Path
 
 import pytest
 from scenes.log_bytes import log_bytes
@@ -54,6 +58,35 @@ def test_a_server_that_does_not_answer_is_an_error_of_one_line(s3, monkeypatch):
     monkeypatch.setenv("AWS_ENDPOINT_URL", "http://127.0.0.1:9")
     s3fs.S3FileSystem.clear_instance_cache()
     assert "cannot be read" in line_of("s3://logs/a.mcap")
+
+
+class _WithoutLength(http.server.SimpleHTTPRequestHandler):
+    """Sends a file and closes the connection where it ends."""
+
+    def do_HEAD(self):
+        self.send_response(200)
+        self.end_headers()
+
+    def do_GET(self):
+        self.do_HEAD()
+        self.wfile.write(Path(self.translate_path(self.path)).read_bytes())
+
+
+@pytest.mark.parametrize(
+    ("handler", "says"),
+    [
+        (http.server.SimpleHTTPRequestHandler, "more than the range that is asked for"),
+        (_WithoutLength, "does not tell how large it is"),
+    ],
+)
+def test_a_server_without_ranges_or_lengths_is_an_error_that_says_so(handler, says, log):
+    with http.server.ThreadingHTTPServer(
+        ("127.0.0.1", 0), functools.partial(handler, directory=str(log.parent))
+    ) as serving:
+        threading.Thread(target=serving.serve_forever, daemon=True).start()
+        line = line_of(f"http://127.0.0.1:{serving.server_port}/a.mcap")
+        serving.shutdown()
+    assert says in line
 
 
 def test_missing_credentials_are_an_error_of_one_line(s3, monkeypatch, tmp_path):
