@@ -7,9 +7,10 @@ the environment of this process and of those that it starts, and comes back wher
 
 import contextlib
 import errno
+import itertools
 import os
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import Any
 from urllib.parse import unquote, urlsplit
@@ -19,20 +20,45 @@ from epipole.schemas.text import without_secrets
 
 # Files behind URLs (fsspec).
 
-SECRETS = "EPIPOLE_URLS"  # URLs with their secrets, a line each
+# URLs with their secrets, a line each. Behind the limit they go on in EPIPOLE_URLS_1, _2 ...:
+# Linux starts no process with a variable of 128 KiB.
+SECRETS = "EPIPOLE_URLS"
+MAX_SECRETS_BYTES = 100_000
 
 
 def known_as(where: str) -> str:
     """Return a path or URL as it may be shown and stored, and keep what was cut from it."""
     shown = without_secrets(where)
     if shown != where and "\0" not in where:
-        kept = [url for url in _secrets() if without_secrets(url) != shown]
-        os.environ[SECRETS] = "\n".join([*kept, where.replace("\n", "%0A")])
+        url, known = where.replace("\n", "%0A"), _secrets()
+        if url not in known:
+            _keep_secrets([*(each for each in known if without_secrets(each) != shown), url])
     return shown
 
 
 def _secrets() -> list[str]:
-    return os.environ.get(SECRETS, "").split("\n")
+    """Return the URLs with secrets that are known, in the order in which they were given."""
+    return [url for name in _variables() for url in os.environ[name].split("\n") if url]
+
+
+def _variables() -> list[str]:
+    names = (f"{SECRETS}_{k}" if k else SECRETS for k in itertools.count())
+    return list(itertools.takewhile(lambda name: name in os.environ, names))
+
+
+def _keep_secrets(urls: Iterable[str]) -> None:
+    texts: list[list[str]] = [[]]
+    size = 0
+    for url in urls:
+        size += len(os.fsencode(url)) + 1
+        if size > MAX_SECRETS_BYTES and texts[-1]:
+            texts.append([])
+            size = len(os.fsencode(url)) + 1
+        texts[-1].append(url)
+    for name in _variables()[len(texts) :]:
+        del os.environ[name]
+    for k, text in enumerate(texts):
+        os.environ[f"{SECRETS}_{k}" if k else SECRETS] = "\n".join(text)
 
 
 def _with_secrets(where: str) -> str:

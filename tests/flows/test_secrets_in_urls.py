@@ -8,6 +8,8 @@ import functools
 import http.server
 import json
 import os
+import subprocess
+import sys
 import threading
 from pathlib import Path
 
@@ -15,7 +17,7 @@ import pytest
 from typer.testing import CliRunner
 
 from epipole.flows.command_line.main import app
-from epipole.io.paths import SECRETS, known_as, line_of
+from epipole.io.paths import SECRETS, _with_secrets, known_as, line_of
 from epipole.schemas.text import without_secrets
 
 PASSWORD, TOKEN = "pw-Zq83kd", "tok-9fJw2x"
@@ -173,3 +175,18 @@ def test_a_rotated_password_takes_the_place_of_the_one_before(monkeypatch):
     monkeypatch.setenv(SECRETS, "")
     assert known_as("http://u:old@h/x") == known_as("http://u:new@h/x") == "http://h/x"
     assert "old" not in os.environ[SECRETS]
+
+
+def test_processes_can_be_started_whatever_the_number_of_signed_urls(monkeypatch):
+    monkeypatch.setattr(os, "environ", os.environ.copy())
+    os.environ[SECRETS] = ""
+    urls = [f"https://h/{k}.mcap?signature={k:0700}" for k in range(500)]
+    for url in urls:
+        known_as(url)
+    for url in urls[::100]:
+        assert _with_secrets(without_secrets(url)) == url
+    known_as("https://h/0.mcap?signature=new")
+    assert _with_secrets("https://h/0.mcap") == "https://h/0.mcap?signature=new"
+    command = "from epipole.io.paths import _with_secrets as w; print(w('https://h/499.mcap'))"
+    run = [sys.executable, "-c", command]
+    assert subprocess.check_output(run, env=os.environ, text=True).strip() == urls[-1]
