@@ -1,6 +1,8 @@
 """The logs in a folder, of a glob or at a URL."""
 
 import glob
+import logging
+import os
 from pathlib import Path
 
 from epipole.io.paths import (
@@ -13,6 +15,8 @@ from epipole.io.paths import (
 )
 from epipole.schemas.errors import LogError
 from epipole.schemas.text import without_secrets
+
+LOGGER = logging.getLogger(__name__)
 
 SUFFIX = ".mcap"  # of the logs in a folder
 PATTERN = f"*{SUFFIX}"
@@ -49,7 +53,7 @@ def _list_local(where: str) -> tuple[list[str], bool]:
     path = Path(where)
     try:
         if path.is_dir():
-            return [str(file) for file in path.rglob(PATTERN) if file.is_file()], False
+            return _list_folder(path), False
         if path.is_file():
             return [where], True
         if path.exists():
@@ -57,6 +61,19 @@ def _list_local(where: str) -> tuple[list[str], bool]:
         return [name for name in glob.iglob(where, recursive=True) if Path(name).is_file()], False
     except OSError as error:
         raise LogError(f"{where}: cannot be read: {error.strerror}") from error
+
+
+def _list_folder(folder: Path) -> list[str]:
+    """Return the logs in a folder, however deep; a line says which folders cannot be read."""
+    logs = []
+    for at, _, names in os.walk(folder, onerror=_warn_of_folder):
+        files = (Path(at) / name for name in names if name.endswith(SUFFIX))
+        logs += [str(file) for file in files if file.is_file()]
+    return logs
+
+
+def _warn_of_folder(error: OSError) -> None:
+    LOGGER.warning("%s: left out: cannot be read: %s", error.filename, error.strerror)
 
 
 def _list_url(where: str) -> tuple[list[str], bool]:

@@ -1,5 +1,6 @@
 """Names of logs and datasets that cannot be used are refused in one line."""
 
+import errno
 import os
 
 import pytest
@@ -38,3 +39,19 @@ def test_a_named_pipe_is_not_opened(tmp_path):
 def test_an_output_of_an_unknown_kind_is_one_line():
     with pytest.raises(DatasetError, match=r"^foo://x: cannot be read: Protocol not known: foo$"):
         check_folder("foo://x")
+
+
+def test_a_folder_among_the_logs_that_cannot_be_read_is_named(tmp_path, monkeypatch, caplog):
+    for name in ("open", "closed"):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "a.mcap").touch()
+    scandir = os.scandir
+
+    def refuse(folder):
+        if str(folder).endswith("closed"):
+            raise PermissionError(errno.EACCES, "Permission denied", str(folder))
+        return scandir(folder)
+
+    monkeypatch.setattr(os, "scandir", refuse)
+    assert list_logs(str(tmp_path)) == ([str(tmp_path / "open" / "a.mcap")], False)
+    assert f"{tmp_path}/closed: left out: cannot be read: Permission denied" in caplog.text
