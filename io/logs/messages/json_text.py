@@ -159,7 +159,8 @@ def _time_ns(value: Any) -> int | None:
         seconds = int((datetime.fromisoformat(match[1] + zone) - _EPOCH).total_seconds())
         return valid_time_ns(seconds, int((match[2] or "0").ljust(9, "0")))
     nanos = value["nsec"] if "nsec" in value else value.get("nanosec", value.get("nanos", 0))
-    return valid_time_ns(int(value["sec"] if "sec" in value else value["seconds"]), int(nanos))
+    seconds = _integer(value["sec"] if "sec" in value else value["seconds"])
+    return valid_time_ns(seconds, int(nanos))
 
 
 def _array(value: Any) -> Array:

@@ -55,6 +55,7 @@ def test_an_invalid_time_is_none(timestamp):
         {"frame_number": 1.5},
         {"exposure_s": None},
         {"timestamp": "yesterday"},
+        {"timestamp": {"sec": 1_554_091_200.5, "nsec": 0}},
     ],
 )
 def test_values_of_the_wrong_type_are_undecodable(changes):
