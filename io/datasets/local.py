@@ -226,9 +226,9 @@ class LocalNights:
                         _read_lock(other).refuse(self._dataset, nights)
                     run.mkdir()
                     file = stack.enter_context((run / LOCK).open("w"))
-                    fcntl.flock(file, fcntl.LOCK_EX)
                     file.write(LockRecord.of(nights).text())
-                    file.flush()
+                    file.flush()  # first: what is locked can be read
+                    fcntl.flock(file, fcntl.LOCK_EX)
                 yield run
         finally:  # of the lock too: Ctrl-C may come between any two of its steps
             _release(self.folder, run)
@@ -238,8 +238,11 @@ class LocalNights:
 
     def locked_nights(self) -> set[str]:
         """Return the nights that living runs have locked."""
-        living = filter(_is_alive, _folders(self.folder / STAGING, "run-*"))
-        return {night for run in living for night in _read_lock(run).nights}
+        nights: set[str] = set()
+        for run in filter(_is_alive, _folders(self.folder / STAGING, "run-*")):
+            with contextlib.suppress(FileNotFoundError):  # it has just ended
+                nights.update(_read_lock(run).nights)
+        return nights
 
     def publish(self, staged: Mapping[str, Path], check: Callable[[], None]) -> None:
         """Put the nights in place, each by one rename: all or none."""

@@ -1,5 +1,6 @@
 """Nights that a run has locked: refused to others, free again however the run ends."""
 
+import fcntl
 import os
 import subprocess
 import sys
@@ -11,7 +12,13 @@ from scenes.dataset_tables import NEXT_NIGHT, NIGHT, OVER_MIDNIGHT, TIMES, conte
 from scenes.published import publish
 
 from epipole.io.datasets import local as local_nights
-from epipole.io.datasets.dataset import lock_nights, nights_in, publish_folders, read_table
+from epipole.io.datasets.dataset import (
+    lock_nights,
+    locked_nights,
+    nights_in,
+    publish_folders,
+    read_table,
+)
 from epipole.schemas.errors import DatasetError
 from epipole.schemas.tables import TABLES
 
@@ -49,6 +56,24 @@ def test_a_second_run_of_a_night_is_refused_and_names_the_first(tmp_path):
     with lock_nights(tmp_path / "out", [NIGHT]):
         pass
     assert not (tmp_path / "out").exists()
+
+
+def test_who_looks_at_the_locks_as_a_run_begins_or_ends_sees_no_damaged_lock(tmp_path, monkeypatch):
+    flock, seen = fcntl.flock, []
+
+    def look(file, how):
+        flock(file, how)
+        if how == fcntl.LOCK_EX and str(getattr(file, "name", "")).endswith("claim"):
+            seen.append(locked_nights(tmp_path / "out"))
+
+    monkeypatch.setattr(fcntl, "flock", look)
+    with lock_nights(tmp_path / "out", [NIGHT]) as work:
+        assert seen == [{NIGHT}]
+        assert locked_nights(tmp_path / "out") == {NIGHT}
+        monkeypatch.setattr(local_nights, "_is_alive", lambda run: run.rename(f"{run}-gone"))
+        assert locked_nights(tmp_path / "out") == set()
+        monkeypatch.undo()
+        Path(f"{work}-gone").rename(work)
 
 
 def test_a_run_of_another_process_is_refused_until_it_is_killed(tmp_path, locking):
