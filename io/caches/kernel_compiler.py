@@ -109,8 +109,13 @@ def report_compiling(report: Callable[[int, int], None], total: int = 0) -> Iter
 
 def _count() -> int | None:
     """Return the number of files in the kernel folder; None: there is no folder yet."""
-    folder = kernel_folder()
-    return None if folder is None else sum(1 for _ in folder.glob("*/*.nbi"))
+    folder, count = kernel_folder(), 0
+    if folder is None:
+        return None
+    for module in folder.glob("*"):
+        with contextlib.suppress(FileNotFoundError):  # another run has just removed it
+            count += sum(1 for _ in module.glob("*.nbi"))
+    return count
 
 
 def compile_into(folder: Path) -> None:

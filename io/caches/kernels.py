@@ -142,13 +142,22 @@ def _trusted(kernels: Path) -> Path:
     A kernel is code: numba runs what it finds.
     """
     fault = fault_of(kernels)
-    if fault is None and not all(is_ours(path.lstat()) for path in kernels.rglob("*")):
+    if fault is None and not _all_ours(kernels):
         fault = "has files of another user"
     if fault is not None:
         LOGGER.warning("%s: kernels are not kept here (%s); remove the folder", kernels, fault)
         return private_folder("kernels")
     _prune(kernels)
     return kernels
+
+
+def _all_ours(kernels: Path) -> bool:
+    for at, folders, files in os.walk(kernels):
+        for name in (*folders, *files):
+            with contextlib.suppress(FileNotFoundError):  # another run has renamed or removed it
+                if not is_ours(os.lstat(os.path.join(at, name))):
+                    return False
+    return True
 
 
 def _filled(folder: Path) -> Path:

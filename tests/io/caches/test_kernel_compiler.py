@@ -5,6 +5,7 @@ import sys
 import time
 
 import pytest
+from scenes.busy_folder import busy
 
 from epipole.io.caches import kernel_compiler, kernel_list, kernels
 from epipole.io.caches.kernel_compiler import (
@@ -153,6 +154,13 @@ def test_what_is_compiled_is_counted_from_the_files_that_appear(folder, monkeypa
 
     assert counted(300) == (1, 300)
     assert counted(0) == (1, 0)  # nobody knows how many there will be
+
+
+def test_files_are_counted_while_another_run_makes_and_removes_some(folder):
+    keep()
+    with busy(folder):
+        for _ in range(20_000):
+            assert kernel_compiler._count() == 1
 
 
 def test_nothing_is_reported_where_nothing_is_compiled(folder, monkeypatch):

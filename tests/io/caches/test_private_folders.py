@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scenes.busy_folder import busy
 
 from epipole.io.caches import kernels
 from epipole.io.caches.arrays import cache_folder, cached
@@ -95,6 +96,13 @@ def test_kernels_that_another_user_has_left_are_not_run(folder, monkeypatch, cap
     use_kernel_cache()
     assert kernel_folder() == private_folder("kernels")
     assert "has files of another user" in caplog.text
+
+
+def test_a_kernel_folder_in_which_another_run_writes_is_used(folder):
+    (folder / "kernels").mkdir(mode=0o700)
+    with busy(folder / "kernels"):
+        for _ in range(500):
+            assert kernels._trusted(folder / "kernels") == folder / "kernels"
 
 
 def test_a_kernel_folder_that_others_can_write_to_is_not_used(folder, monkeypatch):
