@@ -1,7 +1,7 @@
 """When the messages of a log were logged, and its bytes up to a time: found without reading them.
 
 A log that was never closed has no summary: it is still being written, or its recorder was stopped.
-Then the heads of its chunks say it.
+Then the heads of its chunks say it, and also where a summary has no statistics.
 """
 
 import hashlib
@@ -9,7 +9,7 @@ import os
 from collections.abc import Iterator
 from typing import NamedTuple
 
-from epipole.io.logs.mcap.bytes import LogBytes, open_log
+from epipole.io.logs.mcap.bytes import NEAR_BYTES, LogBytes, open_log
 from epipole.io.logs.mcap.container import (
     HEAD_BYTES,
     MAGIC,
@@ -65,7 +65,7 @@ def read_log_times(path: str | os.PathLike[str]) -> tuple[int, int] | None:
     """
     with open_mcap(os.fspath(path)) as data:
         summary = read_summary(data, ChannelTable(frozenset()))
-        if summary.data_end is not None:
+        if summary.logged_ns is not None:
             return summary.logged_ns if summary.logged_ns != (0, 0) else None  # no messages
         try:
             chunks = list(_walked_chunks(data))
@@ -105,12 +105,12 @@ def _chunks(data: LogBytes) -> Iterator[ChunkTimes]:
     summary = read_summary(data, ChannelTable(frozenset()))
     if summary.data_end is None:
         yield from _walked_chunks(data)
-    for at in summary.chunk_offsets:
-        yield _chunk_at(data, at)
+    times_ns = iter(summary.chunk_times)
+    yield from map(ChunkTimes, summary.chunk_offsets, times_ns, times_ns)
 
 
 def _walked_chunks(data: LogBytes) -> Iterator[ChunkTimes]:
-    """Yield the chunks of a log without a summary; the last one may be incomplete.
+    """Yield the chunks of a log from record to record; the last one may be incomplete.
 
     Raises
     ------
@@ -118,20 +118,20 @@ def _walked_chunks(data: LogBytes) -> Iterator[ChunkTimes]:
         Where the records between them are damaged, or have messages: then no chunk tells the times.
     """
     at = len(MAGIC)
+    near_at, near = 0, memoryview(b"")  # records that follow: of a URL each read is a request
     for _ in range(MAX_RECORDS):
         if at + RECORD.size > len(data):
             return
-        opcode, length = RECORD.unpack(data.view(at, at + RECORD.size))
+        if near_at + len(near) < min(at + HEAD_BYTES, len(data)):
+            near_at, near = at, data.view(at, min(at + NEAR_BYTES, len(data)))
+        record = near[at - near_at :]
+        opcode, length = RECORD.unpack_from(record)
         if opcode == CHUNK:
             if len(data) - at < HEAD_BYTES:  # cut
                 return
-            yield _chunk_at(data, at)
+            head = read_head(record[:HEAD_BYTES], at)
+            yield ChunkTimes(at, head.start_ns, head.end_ns)
         elif opcode == MESSAGE or not 0 < opcode <= DATA_END or length > MAX_RECORD_BYTES:
             break
         at += RECORD.size + length
     raise ChunkError(Reason.DAMAGED_RECORD)
-
-
-def _chunk_at(data: LogBytes, at: int) -> ChunkTimes:
-    head = read_head(data.view(at, min(at + HEAD_BYTES, len(data))), at)
-    return ChunkTimes(at, head.start_ns, head.end_ns)

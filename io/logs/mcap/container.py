@@ -203,6 +203,8 @@ class LogSummary:
 
     data_end: int | None = None  # where the data section ends, if the log was closed
     chunk_offsets: "array[int]" = field(default_factory=lambda: array("Q"))  # sorted
+    # When the messages of each chunk were logged [ns]: the first and the last, one after the other.
+    chunk_times: "array[int]" = field(default_factory=lambda: array("Q"))
     declared: dict[int, int] = field(default_factory=dict)  # messages of each channel
     logged_ns: tuple[int, int] | None = None  # when the first and the last message were logged
 
@@ -232,7 +234,10 @@ def read_summary(data: LogBytes, channels: ChannelTable) -> LogSummary:
         _read_records(records, at, summary, channels)
     except (struct.error, ChunkError):
         return LogSummary()  # the records are found without it
-    summary.chunk_offsets = array("Q", np.sort(summary.chunk_offsets).tobytes())
+    offsets, times_ns = np.array(summary.chunk_offsets), np.array(summary.chunk_times)
+    order = np.argsort(offsets, kind="stable")
+    summary.chunk_offsets = array("Q", offsets[order].tobytes())
+    summary.chunk_times = array("Q", times_ns.reshape(-1, 2)[order].tobytes())
     return summary
 
 
@@ -249,9 +254,10 @@ def _read_records(
             with contextlib.suppress(ChunkError):  # the rest of the summary is of use without it
                 channels.declare(opcode, data, body, at)
         elif opcode == CHUNK_INDEX:
-            offset = struct.unpack_from("<Q", data, body + 16)[0]
+            *times_ns, offset = struct.unpack_from("<QQQ", data, body)
             if len(MAGIC) <= offset < file_end:
                 summary.chunk_offsets.append(offset)
+                summary.chunk_times.extend(times_ns)
         elif opcode == STATISTICS:
             *logged_ns, size = struct.unpack_from("<QQI", data, body + 26)
             summary.logged_ns = (logged_ns[0], logged_ns[1])

@@ -1,6 +1,8 @@
 """When messages were logged, and the bytes of a log up to a time, while the log is written."""
 
+import fsspec
 import pytest
+from mcap.writer import Writer
 
 from epipole.io.logs.logged_times import read_digest, read_log_times
 from epipole.io.logs.writer import LogWriter
@@ -49,3 +51,32 @@ def test_what_is_logged_after_a_time_does_not_change_the_digest(closed):
     assert of_open[0] == of_closed[0]
     assert of_open[1] != of_closed[1]
     assert read_digest(str(path), late, "known") == "known"
+
+
+def test_a_closed_log_without_statistics_tells_its_times_by_its_chunks(tmp_path):
+    with (tmp_path / "a.mcap").open("wb") as file:
+        writer = Writer(file, chunk_size=200, use_statistics=False)
+        writer.start()
+        channel = writer.register_channel("/a", "json", 0)
+        for k in range(N_FRAMES):
+            t = START_NS + k * SECOND_NS
+            writer.add_message(channel, t, b"{}", t)
+        writer.finish()
+    last_ns = START_NS + (N_FRAMES - 1) * SECOND_NS
+    assert read_log_times(tmp_path / "a.mcap") == (START_NS, last_ns)
+
+
+@pytest.mark.parametrize(("share", "limit"), [(1.0, 5), (0.9, 10)])
+def test_few_requests_tell_the_times_and_the_digest_of_a_log_behind_a_url(
+    share, limit, closed, monkeypatch
+):
+    memory = fsspec.filesystem("memory")
+    memory.pipe_file("/times/a.mcap", cut(closed, share).read_bytes())
+    cat_file, n = memory.cat_file, []
+    monkeypatch.setattr(memory, "cat_file", lambda *a, **b: n.append(1) or cat_file(*a, **b))
+    early_ns = START_NS + 5 * SECOND_NS
+    assert read_log_times("memory://times/a.mcap") == read_log_times(closed)
+    assert len(n) < limit
+    assert read_digest("memory://times/a.mcap", early_ns) == read_digest(str(closed), early_ns)
+    assert len(n) < 2 * limit
+    memory.rm("/times", recursive=True)
