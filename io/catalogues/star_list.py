@@ -24,6 +24,7 @@ from epipole.schemas.star_lists import (
 REQUIRED = ("star_id", "ra_deg", "dec_deg", "magnitude")
 MOTION = ("pm_ra_mas_yr", "pm_dec_mas_yr")
 MAX_NAMED = 5  # invalid rows that a message names
+LARGEST_FLOAT_ID = 2.0**53  # above it floating-point numbers skip whole ones
 EPOCHS = (1850.0, 2150.0)
 
 # Least and greatest value. The fastest star moves 10.4" per year, and the nearest has a parallax of
@@ -168,7 +169,13 @@ def _columns(read: pl.DataFrame, faults: _Faults) -> dict[str, npt.NDArray[Any]]
 
 def _identities(read: pl.DataFrame, faults: _Faults) -> Integers:
     """Return the ids of the stars. Each must be a whole number, and occur once."""
-    numbers = read["star_id"].cast(pl.Int64, strict=False)
+    given = read["star_id"]
+    if given.dtype.is_float():
+        large = given.is_finite() & (given.abs() > LARGEST_FLOAT_ID)
+        why = "too large for floating-point numbers: write whole numbers"
+        faults.add(large.fill_null(False).to_numpy(), "star_id", why)
+        given = given.set(given.floor() != given, None)  # the cast would cut them
+    numbers = given.cast(pl.Int64, strict=False)
     missing = numbers.is_null().to_numpy()
     faults.add(missing, "star_id", "not a whole number")
     star_id = numbers.fill_null(0).to_numpy().astype(np.int64)

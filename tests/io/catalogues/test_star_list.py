@@ -177,6 +177,20 @@ def test_a_sky_in_another_unit_is_told_from_degrees(parquet, changes, unit):
         read_star_list(parquet(many(**changes)), epoch=2016.0)
 
 
+@pytest.mark.parametrize(
+    ("star_id", "says"),
+    [
+        (1.5, "row 200: star_id = 1.5, not a whole number"),
+        (4472832130942575872.0, "row 200: star_id = .* too large for floating-point numbers"),
+        (np.nan, "row 200: star_id = nan, not a whole number"),
+    ],
+)
+def test_ids_that_floating_point_numbers_do_not_hold_are_refused(parquet, star_id, says):
+    columns = many(star_id=lambda ids: np.where(ids == 199, star_id, ids.astype(float)))
+    with pytest.raises(CatalogueError, match=says):
+        read_star_list(parquet(columns), epoch=2016.0)
+
+
 def test_a_patch_of_sky_in_degrees_is_not_taken_for_radians(parquet):
     columns = many(ra_deg=lambda ra: ra / 360 * 4, dec_deg=lambda dec: dec / 90)
     assert read_star_list(parquet(columns), epoch=2016.0).stars.num_rows == 200
