@@ -94,7 +94,7 @@ def _read(path: Path) -> dict[str, npt.NDArray[Any]] | None:
             os.utime(path)  # marks it as used
     except FileNotFoundError:
         return None
-    except (OSError, ValueError, EOFError, KeyError, zipfile.BadZipFile) as error:
+    except (OSError, ValueError, EOFError, KeyError, RuntimeError, zipfile.BadZipFile) as error:
         log.info("%s: cannot be used and is written again (%s)", path, error)
         return None
     return arrays

@@ -65,6 +65,17 @@ def test_a_damaged_file_is_made_again_and_put_right(folder, damage):
     assert make.calls == 2
 
 
+@pytest.mark.parametrize("at", [6, 8])
+def test_a_file_that_seems_of_another_version_or_encrypted_is_made_again(folder, at):
+    make = Maker()
+    cached("key", make)
+    content = bytearray((folder / "key.npz").read_bytes())
+    content[content.index(b"PK\x01\x02") + at] |= 0x41  # of the first entry in the directory
+    (folder / "key.npz").write_bytes(content)
+    np.testing.assert_array_equal(cached("key", make)["a"], ARRAYS["a"])
+    assert make.calls == 2
+
+
 def test_a_folder_that_cannot_be_written_to_stops_nothing(folder):
     folder.parent.mkdir(exist_ok=True)
     folder.touch()
