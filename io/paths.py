@@ -218,3 +218,13 @@ def refuse_device(path: Path) -> None:
     """
     if path.exists() and not (path.is_file() or path.is_dir()):
         raise OSError(errno.EINVAL, "is a pipe or a device, not a file", str(path))
+
+
+def bytes_in(folder: Path) -> int:
+    """Return the bytes of all files in a folder; those that go meanwhile are not counted."""
+    total = 0
+    for at, _, files in os.walk(folder):
+        for name in files:
+            with contextlib.suppress(FileNotFoundError):
+                total += os.lstat(os.path.join(at, name)).st_size
+    return total

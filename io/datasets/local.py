@@ -36,6 +36,7 @@ from typing import IO, NamedTuple
 
 from epipole.io.datasets.lock_record import STAGING, LockRecord
 from epipole.io.datasets.plain_files import entered, opened, read_small, refuse_link
+from epipole.io.paths import bytes_in
 from epipole.schemas.dates import is_night
 from epipole.schemas.errors import DatasetError
 
@@ -199,7 +200,7 @@ class LocalNights:
 
     def sizes(self) -> dict[str, int]:
         """Return the bytes of each night, and of each file beside the nights."""
-        found = {f"night={n}": _bytes_in(self._night(n)) for n in self.nights()}
+        found = {f"night={n}": bytes_in(self._night(n)) for n in self.nights()}
         for beside in (REPORTS, RUNS):
             for file in sorted((self.folder / beside).glob("[!.]*")):
                 if is_night(file.stem) and file.is_file() and not file.is_symlink():
@@ -253,10 +254,6 @@ class LocalNights:
             _clear(self.folder, staging)
             check()
             _put_all_in_place(self.folder, staged)
-
-
-def _bytes_in(folder: Path) -> int:
-    return sum(path.lstat().st_size for path in folder.rglob("*") if path.is_file())
 
 
 def _umask() -> int:

@@ -18,6 +18,7 @@ from epipole.io.caches.private_folders import fault_of, private_folder
 from epipole.io.datasets.dataset import dataset_folder, lock_nights, locked_nights
 from epipole.io.datasets.lock_record import STAGING
 from epipole.io.datasets.plain_files import refuse_link
+from epipole.io.paths import bytes_in
 from epipole.io.work.kept_parts import move_parts
 from epipole.io.work.recipe import Recipe
 from epipole.io.work.work_layout import WorkFolder
@@ -110,7 +111,7 @@ def unfinished_work(dataset: str, kept: bool = False) -> list[Unfinished]:
             by_night.setdefault(night, []).append(folder)
     for night in locked_nights(dataset) if by_night else ():
         by_night.pop(night, None)
-    return [Unfinished(night, sum(map(_size, f)), f) for night, f in by_night.items()]
+    return [Unfinished(night, sum(map(bytes_in, f)), f) for night, f in by_night.items()]
 
 
 def clear_unfinished(dataset: str, kept: bool = False) -> list[Unfinished]:
@@ -128,7 +129,3 @@ def clear_unfinished(dataset: str, kept: bool = False) -> list[Unfinished]:
             continue
         removed.append(unfinished)
     return removed
-
-
-def _size(folder: Path) -> int:
-    return sum(file.lstat().st_size for file in folder.rglob("*") if file.is_file())

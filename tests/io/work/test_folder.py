@@ -1,5 +1,7 @@
 """Unfinished work: that of stopped runs, never that of a run that goes on."""
 
+from scenes.busy_folder import N_FILES, busy
+
 from epipole.io.datasets.dataset import lock_nights
 from epipole.io.work.folder import clear_unfinished, unfinished_work
 
@@ -33,3 +35,11 @@ def test_a_dataset_without_work_has_none(tmp_path):
     assert unfinished_work(str(tmp_path / "none")) == []
     assert clear_unfinished(str(tmp_path / "none")) == []
     assert not (tmp_path / "none").exists()
+
+
+def test_work_of_a_run_that_begins_or_ends_meanwhile_stops_nothing(tmp_path):
+    left = leave_work(tmp_path, NIGHT)
+    with busy(left):
+        for _ in range(500):
+            (found,) = unfinished_work(str(tmp_path))
+            assert 5 <= found.size <= 5 + N_FILES
