@@ -188,10 +188,14 @@ class LocalNights:
         target = self.folder / folder
         refuse_link(target)
         target.mkdir(exist_ok=True)
-        with tempfile.NamedTemporaryFile(dir=target, prefix=".", delete=False) as file:
-            file.write(data)
-        os.chmod(file.name, 0o666 & ~_umask())
-        Path(file.name).replace(target / name)
+        handle, made = tempfile.mkstemp(dir=target, prefix=".")
+        try:
+            with open(handle, "wb") as file:
+                file.write(data)
+            os.chmod(made, 0o666 & ~_umask())
+            os.replace(made, target / name)
+        finally:
+            Path(made).unlink(missing_ok=True)
 
     def files_beside(self, folder: str, nights: Collection[str] | None = None) -> list[Path]:
         """Return the Parquet files in a folder beside the nights, in order; of all, or of some."""

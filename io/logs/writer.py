@@ -1,5 +1,6 @@
 """Writing MCAP files: logs of sensors, and files for viewers."""
 
+import contextlib
 import errno
 import importlib
 import os
@@ -86,14 +87,23 @@ class McapFile:
         if kind is None:
             self.close()
         else:
-            self._file.close()
-            self._partial.unlink(missing_ok=True)
+            self._abandon()
 
     def close(self) -> None:
         """Write the summary and give the file its name."""
-        self._writer.finish()
-        self._file.close()
-        self._partial.replace(self._path)
+        try:
+            self._writer.finish()
+            self._file.close()
+            self._partial.replace(self._path)
+        except BaseException:
+            self._abandon()
+            raise
+
+    def _abandon(self) -> None:
+        """Remove what was written; on a full disk the file cannot even be closed in order."""
+        with contextlib.suppress(OSError):
+            self._file.close()
+        self._partial.unlink(missing_ok=True)
 
     def write(self, topic: str, schema: Schema, time_ns: int, data: bytes) -> None:
         """Write a message; the first of a topic opens its channel."""

@@ -22,7 +22,13 @@ from scenes.published import publish
 
 from epipole.io.datasets import local
 from epipole.io.datasets import night_tables as night_files
-from epipole.io.datasets.dataset import check_folder, lock_nights, publish_folders, read_table
+from epipole.io.datasets.dataset import (
+    check_folder,
+    lock_nights,
+    publish_folders,
+    read_table,
+    write_beside,
+)
 from epipole.schemas.columns import TIME
 from epipole.schemas.errors import DatasetError
 from epipole.schemas.tables import TABLES
@@ -265,3 +271,9 @@ def test_a_damaged_night_is_named(tmp_path):
     (tmp_path / f"night={NIGHT}/sources/part-0.parquet").write_bytes(b"not parquet")
     with pytest.raises(DatasetError, match="remove the folder of the night"):
         publish(tmp_path, night_tables(TIMES), [NIGHT])
+
+
+def test_a_file_beside_the_nights_that_cannot_be_written_leaves_nothing(tmp_path):
+    with pytest.raises(DatasetError, match="cannot be written"):
+        write_beside(tmp_path, "reports", "x" * 300, b"text")
+    assert list((tmp_path / "reports").iterdir()) == []

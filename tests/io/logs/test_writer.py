@@ -1,11 +1,13 @@
 """Logs that are written here, read with public libraries."""
 
+import errno
 import io
 import json
 
 import numpy as np
 import pytest
 from mcap.reader import make_reader
+from mcap.writer import Writer
 
 from epipole.io.logs.writer import LogWriter
 
@@ -109,6 +111,16 @@ def test_json_has_the_declared_names_and_times(tmp_path):
 def test_the_same_messages_give_the_same_bytes(tmp_path, encoding):
     first = write(tmp_path / "a.mcap", encoding=encoding).read_bytes()
     assert first == write(tmp_path / "b.mcap", encoding=encoding).read_bytes()
+
+
+def test_a_disk_that_is_full_at_the_end_leaves_no_file(tmp_path, monkeypatch):
+    def full(_):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(Writer, "finish", full)
+    with pytest.raises(OSError, match="No space left"):
+        write(tmp_path / "a.mcap")
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_a_writer_that_fails_leaves_no_file(tmp_path):
