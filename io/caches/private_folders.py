@@ -53,11 +53,13 @@ def _locked_folder(purpose: str) -> tuple[Path, int]:
         _clear_left()
         while True:
             folder = Path(tempfile.mkdtemp(prefix=f"{_TEMPORARY}{purpose}-"))
-            lock = os.open(folder, os.O_RDONLY)
-            fcntl.flock(lock, fcntl.LOCK_EX)
-            if folder.exists():  # else another process has just taken it for one that was left
-                return folder, lock
-            os.close(lock)
+            # Another process may just have taken it for one that was left, and removed it.
+            with contextlib.suppress(FileNotFoundError):
+                lock = os.open(folder, os.O_RDONLY)
+                fcntl.flock(lock, fcntl.LOCK_EX)
+                if folder.exists():
+                    return folder, lock
+                os.close(lock)
     except OSError as error:
         raise EpipoleError(
             f"no temporary folder can be made ({error.strerror or error}); "

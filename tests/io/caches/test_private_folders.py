@@ -3,6 +3,7 @@
 import os
 import subprocess
 import sys
+import tempfile
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +13,7 @@ from scenes.busy_folder import busy
 from epipole.io.caches import kernels
 from epipole.io.caches.arrays import cache_folder, cached
 from epipole.io.caches.kernels import HANDED_ON, kernel_folder, use_kernel_cache
-from epipole.io.caches.private_folders import fault_of, private_folder
+from epipole.io.caches.private_folders import fault_of, private_folder, temporary_folder
 from epipole.io.work.folder import work_root
 from epipole.schemas.errors import EpipoleError
 
@@ -206,3 +207,18 @@ def test_a_run_whose_kernel_folder_cannot_be_written_says_so_in_one_line(tmp_pat
     (line,) = run.stderr.splitlines()
     assert line == f"NUMBA_CACHE_DIR={tmp_path}/file: kernels are not kept here (File exists)"
     assert run.stdout.strip() == f"{tmp_path}/cache/kernels"
+
+
+def test_a_temporary_folder_that_another_process_removes_at_once_is_made_anew(monkeypatch):
+    made, mkdtemp = [], tempfile.mkdtemp
+
+    def make(prefix):
+        made.append(mkdtemp(prefix=prefix))
+        if len(made) == 1:
+            os.rmdir(made[0])
+        return made[-1]
+
+    monkeypatch.setattr(tempfile, "mkdtemp", make)
+    with temporary_folder("test") as folder:
+        assert str(folder) == made[1]
+        assert folder.is_dir()
