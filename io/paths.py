@@ -198,13 +198,13 @@ def fault_of_name(name: str) -> str | None:
         return "the name is empty; give a path or a URL"
     if "\0" in name:
         return "the name has a zero character; give another one"
-    parts = [len(os.fsencode(part)) for part in name.split("/")]
-    if "://" not in name and (max(parts) > LONGEST_PART or sum(parts) + len(parts) > LONGEST_PATH):
-        return "the name is too long; give a shorter one"
     try:
         name.encode()
     except UnicodeEncodeError:
         return "the name is not UTF-8; rename it"
+    parts = [len(os.fsencode(part)) for part in name.split("/")]
+    if "://" not in name and (max(parts) > LONGEST_PART or sum(parts) + len(parts) > LONGEST_PATH):
+        return "the name is too long; give a shorter one"
     return None
 
 

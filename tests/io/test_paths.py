@@ -11,7 +11,14 @@ from epipole.schemas.errors import DatasetError, LogError
 
 
 @pytest.mark.parametrize(
-    ("name", "why"), [("", "is empty"), (" ", "is empty"), ("a\0", "zero"), ("\udcff", "UTF-8")]
+    ("name", "why"),
+    [
+        ("", "is empty"),
+        (" ", "is empty"),
+        ("a\0", "zero"),
+        ("\udcff", "UTF-8"),
+        ("a\ud800", "UTF-8"),
+    ],
 )
 def test_a_name_that_cannot_be_used_is_refused(name, why, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
