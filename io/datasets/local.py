@@ -360,9 +360,13 @@ def recover(dataset: Path) -> None:
     Nothing else is changed, and a line says that it was done.
     """
     if any((dataset / STAGING).glob(f"swap-*/{COMMIT}")):
-        with contextlib.suppress(PermissionError), _locked(dataset) as staging:
-            for swap in _folders(staging, "swap-*"):
-                _finish(dataset, swap)
+        try:
+            with _locked(dataset) as staging:
+                for swap in _folders(staging, "swap-*"):
+                    _finish(dataset, swap)
+        except OSError as error:
+            if not isinstance(error, PermissionError) and error.errno != errno.EROFS:
+                raise
 
 
 def _finish(dataset: Path, swap: Path) -> None:

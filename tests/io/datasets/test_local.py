@@ -1,5 +1,6 @@
 """Nights that a run has locked: refused to others, free again however the run ends."""
 
+import errno
 import fcntl
 import os
 import subprocess
@@ -187,13 +188,16 @@ def test_a_publisher_killed_at_any_move_has_published_both_nights_or_none(
     assert contents(tmp_path) == old_and_new[moves > 0]
 
 
-def test_a_reader_that_may_not_write_reads_what_is_there(tmp_path, monkeypatch):
+@pytest.mark.parametrize(
+    "error", [PermissionError(), OSError(errno.EROFS, "Read-only file system")]
+)
+def test_a_reader_that_may_not_write_reads_what_is_there(error, tmp_path, monkeypatch):
     publish(tmp_path, night_tables(TIMES), [NIGHT])
     (tmp_path / ".staging" / "swap-0").mkdir(parents=True)
     (tmp_path / ".staging" / "swap-0" / "commit.json").write_text("{}")
 
     def refused(*_):
-        raise PermissionError
+        raise error
 
     monkeypatch.setattr(local_nights, "opened", refused)
     assert nights_in(tmp_path) == [NIGHT]
