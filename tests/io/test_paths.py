@@ -7,6 +7,7 @@ import pytest
 
 from epipole.io.datasets.dataset import check_folder
 from epipole.io.logs.listing import list_logs
+from epipole.io.logs.reader import read_log
 from epipole.schemas.errors import DatasetError, LogError
 
 
@@ -39,6 +40,8 @@ def test_a_named_pipe_is_not_opened(tmp_path):
     os.mkfifo(tmp_path / "pipe.mcap")
     with pytest.raises(LogError, match="is a pipe or a device, not a file"):
         list_logs(str(tmp_path / "pipe.mcap"))
+    with pytest.raises(LogError, match="is a pipe or a device, not a file"):
+        read_log(tmp_path / "pipe.mcap")
     with pytest.raises(LogError, match="no logs in this folder"):
         list_logs(str(tmp_path))
 

@@ -13,7 +13,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import Protocol, Self
 
-from epipole.io.paths import known_as, open_remote
+from epipole.io.paths import known_as, open_remote, refuse_device
 from epipole.schemas.errors import LogError
 
 # Remote logs.
@@ -213,6 +213,7 @@ def open_log(where: str) -> LogBytes:
     if Path(where).is_dir():
         raise LogError(f"{where}: is a folder; give the logs in it, such as {where}/*.mcap")
     try:
+        refuse_device(Path(where))
         descriptor = os.open(where, os.O_RDONLY | os.O_CLOEXEC)
     except FileNotFoundError as error:
         raise LogError(f"{where}: no such file; check the path") from error
