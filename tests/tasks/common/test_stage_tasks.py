@@ -92,7 +92,7 @@ def test_a_log_is_read_again_only_after_a_fault_of_the_storage(
 ):
     asked = []
 
-    def faulty(path):
+    def faulty(path, **_):
         asked.append(path)
         for piece in read_log_pieces(path):
             yield piece
