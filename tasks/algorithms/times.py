@@ -193,6 +193,7 @@ def restart_shifts(time_ns: Integers, frame_number: Integers) -> Integers:
             starts.append(fall)
             shifts.append(highest + 1 - int(number[fall]))
     of_number = np.repeat(shifts, np.diff(starts, append=len(number)))
+    of_number[number > LARGEST_NUMBER] = 0  # with a shift it would not fit
     out = np.zeros(len(f), np.int64)
     out[order] = of_number[np.cumsum(first) - 1]
     return out

@@ -241,6 +241,14 @@ def test_a_counter_of_eight_bits_never_gives_a_number_twice():
     assert (np.diff(numbered) == 1).all()
 
 
+def test_the_largest_number_after_a_restart_stays_as_it_is():
+    number = np.concatenate([np.arange(100), np.arange(50), [2**63 - 1], np.arange(51, 100)])
+    shift = restart_shifts(np.arange(200), number)
+    assert shift[150] == 0
+    assert (shift[100:150] == 100).all()
+    assert (shift[151:] == 100).all()
+
+
 def test_numbers_of_two_sensors_with_one_id_do_not_change():
     rng = np.random.default_rng(2)
     number = np.stack([np.arange(400), np.arange(400) + 57], axis=1)
