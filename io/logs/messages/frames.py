@@ -68,6 +68,7 @@ class FrameColumns:
     _sensors: NameCodes = field(default_factory=NameCodes)
     _rows: _Rows = field(default_factory=lambda: _Rows(0, 0))
     _tables: list[pa.Table] = field(default_factory=list)
+    _table_bytes: int = 0
 
     def add(self, batch: MessageBatch) -> None:
         """Take the frames whose time, sensor, number and arrays are valid.
@@ -91,12 +92,12 @@ class FrameColumns:
     def n_bytes(self) -> int:
         """About the size of the rows that have not been taken."""
         waiting = self._rows.n_centroids * CENTROID_BYTES + self._rows.n * ROW_BYTES
-        return waiting + sum(rows.nbytes for rows in self._tables)
+        return waiting + self._table_bytes
 
     def take(self) -> pa.Table:
         """Return EXPOSURES of the frames since the last call, in the order of the log."""
         self._close()
-        tables, self._tables = self._tables, []
+        tables, self._tables, self._table_bytes = self._tables, [], 0
         return pa.concat_tables([EXPOSURES.empty_table(), *tables])
 
     def _make_room(self, n: int, n_centroids: int) -> None:
@@ -125,6 +126,7 @@ class FrameColumns:
             "offset": rows.offset[:n],
         }
         self._tables.append(table(EXPOSURES, columns))
+        self._table_bytes += self._tables[-1].nbytes
 
     # Frames that were decoded one at a time
 

@@ -50,6 +50,7 @@ class StateColumns:
     _rows: StateRows = field(default_factory=lambda: _new_rows(0))
     _n: int = 0
     _tables: list[pa.Table] = field(default_factory=list)
+    _table_bytes: int = 0
 
     def add(self, batch: MessageBatch) -> None:
         """Take the valid states; where only the attitude is invalid, the state stays without it."""
@@ -69,12 +70,12 @@ class StateColumns:
     @property
     def n_bytes(self) -> int:
         """About the size of the rows that have not been taken."""
-        return self._n * ROW_BYTES + sum(rows.nbytes for rows in self._tables)
+        return self._n * ROW_BYTES + self._table_bytes
 
     def take(self) -> pa.Table:
         """Return LOG_STATES of the states since the last call, in the order of the log."""
         self._close()
-        tables, self._tables = self._tables, []
+        tables, self._tables, self._table_bytes = self._tables, [], 0
         return pa.concat_tables([LOG_STATES.empty_table(), *tables])
 
     def _close(self) -> None:
@@ -100,6 +101,7 @@ class StateColumns:
             },
         )
         self._tables.append(states)
+        self._table_bytes += states.nbytes
 
     def _judge(self, received: Sequence[Received]) -> None:
         """Take decoded states; invalid ones become rejects."""
