@@ -135,6 +135,7 @@ def ask(path: str, runs: int) -> None:
             if run:  # the first brings the files into memory
                 wall_s[name].append(time.perf_counter() - wall)
                 cpu_s[name].append(time.process_time() - cpu)
+    print("| query | rows | wall s | least wall s | CPU s | goal s |")
     for name, (_, goal_s) in QUERIES.items():
         wall, cpu = statistics.median(wall_s[name]), statistics.median(cpu_s[name])
         print(

@@ -116,7 +116,8 @@ def commit() -> str:
     )
     if name.returncode:
         return "no commit"
-    changed = subprocess.run([*git, "diff", "--quiet", "HEAD", "--", ".", ":!BENCHMARKS.md"])
+    written = [f":!{page.name}" for page in (PAGE, README)]  # by a round before
+    changed = subprocess.run([*git, "diff", "--quiet", "HEAD", "--", ".", *written])
     return name.stdout.strip() + (" with changes" if changed.returncode else "")
 
 
@@ -179,8 +180,8 @@ def as_markdown(output: str) -> str:
 
 
 def part_of(benchmark: Benchmark, result: Result, *, alone: bool) -> str:
-    """Return the text of a part; with `alone` also its date, commit and machine."""
-    of_its_own = f" {result.date}, commit {result.commit}; {result.machine}." if alone else ""
+    """Return the text of a part; with `alone` also its date and commit."""
+    of_its_own = f" {result.date}, commit {result.commit}." if alone else ""
     head = f"`{benchmark.command}` ({result.seconds:.0f} s).{of_its_own}"
     return f"{head}\n\n{as_markdown(result.output)}"
 
@@ -201,7 +202,8 @@ def write_page(results: dict[str, Result]) -> None:
         minutes = sum(result.seconds for result in results.values()) / 60
         said = f"All tables: {date}, commit {which}; {where}; {minutes:.0f} minutes.\n"
     else:
-        said = "Not all tables are of one commit yet: each says its date and commit.\n"
+        machines = " or ".join(sorted({result.machine for result in results.values()}))
+        said = f"Not all tables are of one commit yet: each says its date and commit. {machines}.\n"
     text = with_part(text, MACHINE, said)
     for name, result in results.items():
         if name == OF_README:
