@@ -17,12 +17,19 @@ from epipole.schemas.rejects import ObjectVerdict, Reason, reject_rows
 from epipole.schemas.tables import OBSERVATIONS, ORBITS, POSITIONS, REJECTS, SENSOR_ERRORS, STATES
 from epipole.tasks.algorithms.constants import ARCSEC
 from epipole.tasks.algorithms.orbits.illumination import illumination
+from epipole.tasks.algorithms.orbits.orbit_determination import DeterminedOrbit
 from epipole.tasks.algorithms.orbits.orbital_elements import elements_of
+from epipole.tasks.algorithms.orbits.shared_errors import no_equations
 from epipole.tasks.algorithms.orbits.trajectories import propagate_unknowns
 from epipole.tasks.common.orbit_forces import surroundings_of
 from epipole.tasks.publish import manoeuvres, orbits
 from epipole.tasks.publish.fitted_observations import complete_observations
-from epipole.tasks.publish.object_orbits import best_orbit, observed_objects
+from epipole.tasks.publish.object_orbits import (
+    FittedOrbit,
+    best_orbit,
+    judge,
+    observed_objects,
+)
 from epipole.tasks.publish.orbits import fit_orbits, write_orbits
 from epipole.tasks.publish.share_out import share_out
 
@@ -384,3 +391,21 @@ def test_the_cut_that_explains_most_is_found_wherever_it_is():
     for span in range(60):
         for best in range(span + 1):
             assert manoeuvres._least(lambda k, best=best: float(abs(k - best)), 0, span) == best
+
+
+@pytest.mark.parametrize(
+    ("n", "square", "reason"),
+    [
+        (600_000, 1.02, None),
+        (600_000, 1.10, Reason.ORBIT_MISFIT),
+        (50, 1.30, None),
+        (50, 2.20, Reason.ORBIT_MISFIT),
+    ],
+)
+def test_a_million_directions_may_have_sigmas_that_are_right_to_a_per_cent(n, square, reason):
+    dof = 2 * n - 6
+    orbit = DeterminedOrbit(
+        np.zeros(8), np.eye(8), square * dof, np.ones(n, bool), np.zeros((1, 6)), np.zeros(n),
+        no_equations(1),
+    )  # fmt: skip
+    assert judge(FittedOrbit(orbit, 0.0, "")) == reason
