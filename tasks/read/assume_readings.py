@@ -105,9 +105,7 @@ def _of_sensor(rows: pa.Table, assumed: Assumption) -> Flags:
 
 
 def _with_times(rows: pa.Table, assumed: Assumption) -> pa.Table:
-    time_ns = array(rows, "time")
-    moved = time_ns - np.where(_of_sensor(rows, assumed), _ahead_ns(time_ns, assumed), 0)
-    return _with_column(rows, "time", pa.array(moved))
+    return _moved(rows, assumed, -_ahead_ns(array(rows, "time"), assumed))
 
 
 def _with_frame_times(exposures: pa.Table, assumed: Assumption) -> pa.Table:
@@ -116,8 +114,12 @@ def _with_frame_times(exposures: pa.Table, assumed: Assumption) -> pa.Table:
     if to_middle == 0.0 and assumed.frames_ahead_s == 0.0:
         return exposures
     later_s = to_middle * array(exposures, "exposure_s") - assumed.frames_ahead_s
-    later_ns = np.where(_of_sensor(exposures, assumed), _in_ns(later_s), 0)
-    return _with_column(exposures, "time", pa.array(array(exposures, "time") + later_ns))
+    return _moved(exposures, assumed, _in_ns(later_s))
+
+
+def _moved(rows: pa.Table, assumed: Assumption, later_ns: Nanoseconds) -> pa.Table:
+    moved = array(rows, "time") + np.where(_of_sensor(rows, assumed), later_ns, 0)
+    return _with_column(rows, "time", pa.array(moved))
 
 
 def _with_states(states: pa.Table, assumed: Assumption) -> pa.Table:
