@@ -59,8 +59,10 @@ def read_star_residuals(
     for its stars (`checks`), else the median of its detections, which are as bright as they happen
     to be. The fit of the attitude takes 3 of the 2 n degrees of freedom of n stars.
     """
-    stated_px = _stated_px(night, sensors)
-    sigma_px = np.where(np.isfinite(stated_px), stated_px, _sigmas_px(night, sensors, calibrations))
+    sigma_px = _stated_px(night, sensors)
+    if np.isnan(sigma_px).any():  # else the detections need not be read
+        of_detections = _sigmas_px(night, sensors, calibrations)
+        sigma_px = np.where(np.isnan(sigma_px), of_detections, sigma_px)
     sums = _ResidualSums(sensors, sigma_px, _sizes(night, sensors))
     for rows in night.pieces("stars", COLUMNS):
         sums.add(rows)
