@@ -179,9 +179,15 @@ def as_markdown(output: str) -> str:
     return "\n".join(texts)
 
 
-def part_of(benchmark: Benchmark, result: Result, *, alone: bool) -> str:
-    """Return the text of a part; with `alone` also its date and commit."""
-    of_its_own = f" {result.date}, commit {result.commit}." if alone else ""
+def part_of(
+    benchmark: Benchmark, result: Result, *, alone: bool, on_one_machine: bool = False
+) -> str:
+    """Return the text of a part; with `alone` also its date, commit and machine.
+
+    With `on_one_machine` the page says the machine of all parts.
+    """
+    where = "" if on_one_machine else f"; {result.machine}"
+    of_its_own = f" {result.date}, commit {result.commit}{where}." if alone else ""
     head = f"`{benchmark.command}` ({result.seconds:.0f} s).{of_its_own}"
     return f"{head}\n\n{as_markdown(result.output)}"
 
@@ -196,21 +202,24 @@ def write_page(results: dict[str, Result]) -> None:
     """Put all results in their parts."""
     text = PAGE.read_text()
     origins = {(result.date, result.commit, result.machine) for result in results.values()}
+    machines = {result.machine for result in results.values()}
+    on_one_machine = len(machines) == 1
     whole = len({origin[1:] for origin in origins}) == 1 and set(results) == set(PLAN)
     if whole:
         date, which, where = max(origins)
         minutes = sum(result.seconds for result in results.values()) / 60
         said = f"All tables: {date}, commit {which}; {where}; {minutes:.0f} minutes.\n"
     else:
-        machines = " or ".join(sorted({result.machine for result in results.values()}))
-        said = f"Not all tables are of one commit yet: each says its date and commit. {machines}.\n"
+        said = "Not all tables are of one commit yet: each says its date and commit.\n"
+        if on_one_machine:
+            said = f"{said.strip()} {', '.join(machines)}.\n"
     text = with_part(text, MACHINE, said)
     for name, result in results.items():
         if name == OF_README:
             content = part_of(PLAN[name], result, alone=True)
             README.write_text(with_part(README.read_text(), name, content))
         else:
-            content = part_of(PLAN[name], result, alone=not whole)
+            content = part_of(PLAN[name], result, alone=not whole, on_one_machine=on_one_machine)
             text = with_part(text, name, content)
     PAGE.write_text(text)
 

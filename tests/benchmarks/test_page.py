@@ -59,7 +59,9 @@ def test_a_part_names_its_commit_only_if_the_page_has_no_common_one():
     assert part_of(one, result(), alone=False).startswith(
         "`python tests/benchmarks/bench_clocks.py --offsets 0.1` (12 s).\n\n| a |"
     )
-    assert "2031-04-01, commit abc." in part_of(one, result(), alone=True)
+    assert "2031-04-01, commit abc; 2 cores." in part_of(one, result(), alone=True)
+    said = part_of(one, result(), alone=True, on_one_machine=True)
+    assert "2031-04-01, commit abc." in said
 
 
 @pytest.fixture
@@ -87,6 +89,8 @@ def test_parts_that_are_not_measured_stay_as_they_are(copy):
     assert "Not all tables are of one commit yet" in text
     start = before.index("<!-- end of clocks -->")
     assert before[start:] in text
+    # The part of the machine is measured too.
+    assert before[: before.index("<!-- machine -->")] in text
     first = before.index("<!-- end of machine -->")
     assert before[first : before.index("<!-- clocks -->")] in text
 
