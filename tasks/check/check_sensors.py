@@ -14,7 +14,7 @@ from epipole.schemas.arrays import Array
 from epipole.schemas.bridge import array, concat, stack, stack_covariance, to_polars
 from epipole.schemas.columns import TANGENT_AXES
 from epipole.schemas.rejects import Reason
-from epipole.schemas.spans import Sensor, Span
+from epipole.schemas.spans import DAY_NS, Sensor, Span
 from epipole.schemas.stages import Stage
 from epipole.schemas.work_tables import CLOCK_LINES, OBJECT_VIEWS, VIEWS
 from epipole.tasks.algorithms.constants import ARCSEC
@@ -259,12 +259,42 @@ def _lines(rows: pl.DataFrame, sensors: pl.Series) -> Lines:
         group=rows.select(pl.struct("epoch", "object_id").rle_id()).to_series().to_numpy(),
         sensor=np.asarray(sensors.search_sorted(rows["sensor_id"]), np.int64),
         u=stack(rows, "u{}"),
-        cov=_direction_cov(rows, "noise") + _error_of_parts(rows),
+        cov=_error_of_frames(rows) + _error_of_parts(rows),
         x_km=stack(rows, "{}_km"),
         v_km_s=stack(rows, "v{}_km_s"),
         r_km=stack(rows, "sensor_{}_km"),
         v_sensor_km_s=stack(rows, "sensor_v{}_km_s"),
     )
+
+
+def _error_of_frames(rows: pl.DataFrame) -> Array:
+    """Return the noise, with what lines of the same frames share as independent errors [rad^2].
+
+    Lines of a sensor at an epoch share the noise of its attitude. Lines of a tracklet at nearby
+    epochs are fitted to the same detections: if each is in n of the fits, their mean is as wrong
+    as if each line had an independent error of n times its variance.
+    """
+    at_epoch = rows.select(pl.len().over("sensor_id", "epoch")).to_series().to_numpy()
+    turn = ((at_epoch - 1) * rows["turn_noise_rad2"].to_numpy())[:, None, None] * np.eye(2)
+    return _fits_per_detection(rows)[:, None, None] * (_direction_cov(rows, "noise") + turn)
+
+
+def _fits_per_detection(rows: pl.DataFrame) -> Array:
+    """Return in how many lines of a tracklet the detections of each line are fitted: (n,)."""
+    tracklet = rows.select(pl.struct("sensor_id", "tracklet_id").rank("dense")).to_series()
+    start = rows["first_fitted"].min()
+    # In microseconds, so that a tracklet's rank and a time in the night are one integer.
+    first, last = (
+        tracklet.cast(pl.Int64) * (4 * DAY_NS // 1000)
+        + (rows[name] - start).dt.total_microseconds()
+        for name in ("first_fitted", "last_fitted")
+    )
+    begun, ended = np.sort(first.to_numpy()), np.sort(last.to_numpy())
+    fits = [
+        np.searchsorted(begun, at, side="right") - np.searchsorted(ended, at, side="left")
+        for at in (first.to_numpy(), ((first + last) // 2).to_numpy(), last.to_numpy())
+    ]
+    return np.mean(fits, axis=0)
 
 
 def _error_of_parts(rows: pl.DataFrame) -> Array:

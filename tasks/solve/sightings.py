@@ -61,7 +61,8 @@ class TrackletSightings(NamedTuple):
     """Sightings sorted by tracklet, then frame.
 
     Tracklet k has the rows ``bounds[k]:bounds[k + 1]``, and the id ``name[k]``. `blend_rad2` is a
-    part of `cov_bias`: the variance per axis that the light of a neighbour may add.
+    part of `cov_bias`: the variance per axis that the light of a neighbour may add. `turn_rad2` is
+    a part of `cov_noise`: that of the attitude, which all detections of a frame share.
     """
 
     frame: Indices
@@ -71,6 +72,7 @@ class TrackletSightings(NamedTuple):
     cov_noise: Array
     cov_bias: Array
     blend_rad2: Array
+    turn_rad2: Array
     flux: Array
     bounds: Indices
     name: npt.NDArray[np.object_]
@@ -186,6 +188,8 @@ def _by_tracklet(frames: Frames, tracked: pa.Table, cameras: pa.Table) -> Trackl
     rank = rank[sightings.row]
     order = np.lexsort((sightings.frame, rank))
     bounds = group_offsets(rank[order])
+    centroid_rad2 = (array(tracked, "sigma_arcsec")[sightings.row] * ARCSEC) ** 2
+    turn_rad2 = np.trace(sightings.cov_noise, axis1=1, axis2=2) / 2 - centroid_rad2
     return TrackletSightings(
         sightings.frame[order],
         sightings.time_ns[order],
@@ -194,6 +198,7 @@ def _by_tracklet(frames: Frames, tracked: pa.Table, cameras: pa.Table) -> Trackl
         sightings.cov_noise[order],
         sightings.cov_bias[order],
         np.zeros(len(order)),
+        np.maximum(turn_rad2, 0.0)[order],
         array(tracked, "flux").astype(float)[sightings.row[order]],
         bounds,
         names[rank[order[bounds[:-1]]]].astype(object),
@@ -225,6 +230,7 @@ def _with_blends(tracklets: TrackletSightings, frames: Frames, camera: Camera) -
         tracklets.cov_noise[of_object],
         cov_bias[of_object],
         variance[of_object],
+        tracklets.turn_rad2[of_object],
         tracklets.flux[of_object],
         left[tracklets.bounds],
         tracklets.name,
@@ -252,9 +258,11 @@ def _with_split_prior(
     n_frames = len(np.unique(tracklets.frame[prior]))
     stays = np.maximum(1.0 - share, share / np.sqrt(n_frames))
     noise, bias = tracklets.cov_noise.copy(), tracklets.cov_bias.copy()
+    turn_rad2 = tracklets.turn_rad2.copy()
     noise[prior] += share[:, None, None] * bias[prior]
+    turn_rad2[prior] += share * stated
     bias[prior] *= stays[:, None, None]
-    return tracklets._replace(cov_noise=noise, cov_bias=bias)
+    return tracklets._replace(cov_noise=noise, cov_bias=bias, turn_rad2=turn_rad2)
 
 
 class _AboutMotion(NamedTuple):

@@ -21,7 +21,7 @@ from epipole.tasks.common.grouping import factorize
 # Columns of VIEWS that are only passed on.
 LABELS = (
     *("epoch", "sensor_id", "frame_number", "tracklet_id", "centroid", "x_px", "y_px"),
-    *("attitude_rad2", "field_part"),
+    *("attitude_rad2", "turn_noise_rad2", "field_part", "first_fitted", "last_fitted"),
 )
 
 

@@ -149,9 +149,8 @@ def _view_table(
         half_width_s,
     )
     centroid, missed = _centroids(tracklets, query)
-    q = interpolate_quaternions((frames.time_ns - origin) / 1e9, frames.q_sensor_from_icrs, at_s)
-    u, fitted = motion.u, motion.fitted
-    R = matrix_from_quaternion(q)
+    frame_s, u, fitted = (frames.time_ns - origin) / 1e9, motion.u, motion.fitted
+    R = matrix_from_quaternion(interpolate_quaternions(frame_s, frames.q_sensor_from_icrs, at_s))
     u_sensor = np.einsum("nij,nj->ni", R, aberrate(u, v[frame]))
     x_px, y_px = project(camera, u_sensor)
     r_km, v_km_s = states_near_frames(frames, frame, array(epochs, "dt_s")[row])
@@ -176,6 +175,7 @@ def _view_table(
         **unstack_covariance("cov_bias_{}_rad2", cov_bias, TANGENT_AXES),
         "blend_rad2": blend_rad2,
         "attitude_rad2": turn / 2,
+        "turn_noise_rad2": _turn_noise(tracklets, fitted, cov_noise),
         "field_part": _field_parts(camera, x_px, y_px),
         "first_fitted": tracklets.time_ns[fitted[:, 0]],
         "last_fitted": tracklets.time_ns[fitted[:, 1] - 1],
@@ -190,6 +190,16 @@ def _view_table(
     columns |= {name: nullable(values) for name, values in velocity.items()}
     columns["centroid"] = pa.array(centroid[kept], mask=missed[kept])
     return table(VIEWS, columns)
+
+
+def _turn_noise(tracklets: TrackletSightings, fitted: Indices, cov_noise: Array) -> Array:
+    """Return the attitude's part of the noise of views, per axis [rad^2].
+
+    It is as in the middle one of the detections that each view is fitted to.
+    """
+    middle = (fitted[:, 0] + fitted[:, 1] - 1) // 2
+    whole = np.trace(tracklets.cov_noise[middle], axis1=1, axis2=2)
+    return tracklets.turn_rad2[middle] / whole * np.trace(cov_noise, axis1=1, axis2=2)
 
 
 def _without_blends(

@@ -1,6 +1,7 @@
 """Check of sensors: what was corrected and what remains; nothing from nothing."""
 
 import numpy as np
+import pytest
 from scenes.associations import filled
 from scenes.late_sensors import POSITION_KM, SIGMA, lines_of
 
@@ -46,16 +47,20 @@ def test_without_views_no_clock_is_known():
     assert sensor_verdicts(to_polars(lines), {"a": 0.5}) == JudgedSights([])
 
 
-def rows_of(lines, attitude_rad2):
-    """Return CLOCK_LINES of nine objects, each in a part of the fields of its own."""
+def rows_of(lines, attitude_rad2, noise=SIGMA, turn_noise=0.0, fitted_s=0):
+    """Return CLOCK_LINES of nine objects, each in a part of the fields of its own, at epochs every
+    2 s, each fitted to detections within `fitted_s` of it."""
     n = len(lines.group)
-    epoch, number = lines.group % 60, lines.group // 60
+    epoch, number = 2_000_000_000 * (lines.group % 60), lines.group // 60
     columns = {
+        "first_fitted": epoch - 1_000_000_000 * fitted_s,
+        "last_fitted": epoch + 1_000_000_000 * fitted_s,
+        "tracklet_id": [f"t{k}" for k in number], "turn_noise_rad2": np.full(n, turn_noise**2),
         "epoch": epoch, "sensor_id": [f"s{s}" for s in lines.sensor], "field_part": number,
         "object_id": [f"o{k}" for k in number], "position_sigma_km": np.full(n, POSITION_KM),
         "attitude_rad2": np.full(n, attitude_rad2),
     }  # fmt: skip
-    for name, cov in (("noise", SIGMA**2), ("bias", PER_OBJECT**2)):
+    for name, cov in (("noise", noise**2 + turn_noise**2), ("bias", PER_OBJECT**2)):
         columns |= {f"cov_{name}_{a}{a}_rad2": np.full(n, cov) for a in "12"}
     for pattern, values in (
         ("u{}", lines.u), ("{}_km", lines.x_km), ("v{}_km_s", lines.v_km_s),
@@ -78,6 +83,35 @@ def test_errors_of_optics_that_differ_over_the_field_are_no_faults_of_sensors():
     alike = sensor_verdicts(rows_of(lines, PER_OBJECT**2))
     faulty = any(one.is_faulty for one in alike.verdicts)
     assert faulty or alike.doubt.undecided or alike.doubt.spread_log_odds > 6.0
+
+
+def offsets_in_sigmas(seed, noise, turn_noise):
+    """Return the offsets found for sound sensors, in their sigmas.
+
+    Lines are fitted to the detections of three epochs, of `noise` each, and all lines of a sensor
+    at an epoch are turned alike.
+    """
+    rng = np.random.default_rng(seed)
+    lines = lines_of(seed, np.zeros(4))
+    number, epoch = lines.group // 60, lines.group % 60
+    of_detection = rng.normal(size=(4, 9, 62, 3)) * noise * np.sqrt(3)
+    of_line = (of_detection[:, :, :-2] + of_detection[:, :, 1:-1] + of_detection[:, :, 2:]) / 3
+    turn = rng.normal(size=(4, 62, 3)) * turn_noise * np.sqrt(3)
+    turn = (turn[:, :-2] + turn[:, 1:-1] + turn[:, 2:]) / 3
+    u = lines.u + of_line[lines.sensor, number, epoch]
+    u += np.cross(turn[lines.sensor, epoch], lines.u)
+    lines = lines._replace(u=u / np.linalg.norm(u, axis=1)[:, None])
+    rows = rows_of(lines, 0.0, np.hypot(noise, SIGMA), turn_noise, 2)
+    judged = sensor_verdicts(rows.with_columns(cov_bias_11_rad2=0.0, cov_bias_22_rad2=0.0))
+    assert not any(one.is_faulty for one in judged.verdicts)
+    assert judged.doubt.spread_log_odds < 3.0
+    return [one.offset_s / one.sigma_s for one in judged.verdicts]
+
+
+@pytest.mark.parametrize(("noise", "turn_noise"), [(6.0, 0.0), (3.0, 3.0)])
+def test_what_lines_of_the_same_frames_share_is_not_counted_as_independent(noise, turn_noise):
+    found = [offsets_in_sigmas(k, noise * SIGMA, turn_noise * SIGMA) for k in range(40)]
+    assert 0.8 < np.sqrt(np.mean(np.square(found))) < 1.2
 
 
 def test_without_objects_no_clock_is_known(tmp_path):
