@@ -40,7 +40,7 @@ from epipole.tasks.algorithms.tracking.linking.chains import (
     chain_heads,
 )
 from epipole.tasks.algorithms.tracking.local_motion import directions_at
-from epipole.tasks.algorithms.tracking.runs import NONE, follow_detections
+from epipole.tasks.algorithms.tracking.runs import NONE, SkyDetections, follow_detections
 from epipole.tasks.common.batches import Batch
 from epipole.tasks.common.sightings import (
     Frames,
@@ -226,14 +226,20 @@ def _parts(
         yield _TrackedFrames(unsolved, sightings, camera, cameras, interval_s, False)
 
 
-def _follow(part: _TrackedFrames, sightings: Sightings, settings: TrackletSettings) -> Integers:
+def _follow(
+    part: _TrackedFrames, sightings: Sightings, detections: pa.Table, settings: TrackletSettings
+) -> Integers:
     """Return the track number of each sighting; NONE where it belongs to no track."""
     frames, camera, interval_s = part.frames, part.camera, part.interval_s
-    return follow_detections(
+    seen = SkyDetections(
         (frames.time_ns - frames.time_ns[0]) / 1e9,
         sightings.offsets,
         sightings.u_icrs,
         sighting_sigma(sightings),
+        array(detections, "flux").astype(float)[sightings.row],
+    )
+    return follow_detections(
+        seen,
         max_rate_rad_s=np.radians(settings.max_rate_deg_s),
         # Half a frame of slack, for jitter.
         max_coast_s=(settings.max_missed + 1.5) * interval_s,
@@ -266,7 +272,7 @@ def _label(
         labels.kind[sightings.row[planet]] = "planet"
     kept = ~hot & ~planet
     sightings, suspected = part_of(sightings, kept), fixed.with_odds(LIKELY)[kept]
-    track = _follow(part, sightings, settings)
+    track = _follow(part, sightings, detections, settings)
     runs = measure_runs(frames, sightings, track, camera, half_width_s)
     if part.on_sky:
         u_stars = star_directions(frames, identified, part.cameras)

@@ -14,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from epipole.schemas.arrays import Array
-from epipole.tasks.algorithms.tracking.runs import follow_detections
+from epipole.tasks.algorithms.tracking.runs import SkyDetections, follow_detections
 
 sys.path.append(str(Path(__file__).parents[1]))  # what tests share
 from scenes.few_frames import FIELD_RAD as SMALL_FIELD_RAD
@@ -98,9 +98,8 @@ def follow(scene: Night, **changes: float) -> Labels:
         "false_alarm": 1e-4,
     }
     sigma = np.full(len(scene.u_icrs), SIGMA_RAD)
-    return follow_detections(
-        scene.time_s, scene.offsets, scene.u_icrs, sigma, **(options | changes)
-    )
+    seen = SkyDetections(scene.time_s, scene.offsets, scene.u_icrs, sigma)
+    return follow_detections(seen, **(options | changes))
 
 
 def few(n_false: float, seeds: int, missed: float, **changes: float) -> tuple[float, float, float]:
@@ -118,7 +117,7 @@ def few(n_false: float, seeds: int, missed: float, **changes: float) -> tuple[fl
     whole, some = np.zeros(3), np.zeros(3)
     for seed in range(seeds):
         scene = few_frames(seed, 2, n_false, sigma_px=0.8, missed=missed)
-        track = follow_detections(*scene[:4], **(options | changes))
+        track = follow_detections(SkyDetections(*scene[:4]), **(options | changes))
         whole += found_and_false(scene, track, 5)
         some += found_and_false(scene, track, 3)
     return whole[0] / whole[1], some[0] / some[1], whole[2] / seeds

@@ -45,7 +45,7 @@ def common_motion(
     Parameters
     ----------
     time_s, offsets, u_icrs, sigma_rad
-        As in `follow_detections`.
+        As in `SkyDetections`.
     track : (n,) int
         Track of each detection, -1 without a track. Some may be mixed: means are robust.
     """

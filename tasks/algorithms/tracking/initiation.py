@@ -19,6 +19,12 @@ import numpy as np
 
 from epipole.schemas.arrays import Array, Indices
 from epipole.tasks.algorithms.kernels import kernel
+from epipole.tasks.algorithms.tracking.brightness import SIZE as BRIGHTNESS_SIZE
+from epipole.tasks.algorithms.tracking.brightness import (
+    begin_brightness,
+    brightness_chi2,
+    learn_brightness,
+)
 from epipole.tasks.algorithms.tracking.sky_filter import (
     SIZE,
     advance,
@@ -64,6 +70,7 @@ class Detections(NamedTuple):
     frame_of, directions, variances : (n,) int64, (n, 3), (n,) float, of detections: rows of the
         frames, unit vectors, and variances per axis [rad^2]. The axes are those of ICRS, or move
         with the common motion; all times are then in units of `COMMON_FACTOR` [s]
+    log_flux : (n,) float, see `brightness`
     track : (n,) int64, the track of each detection, NONE while it is free; kernels write it
     """
 
@@ -72,6 +79,7 @@ class Detections(NamedTuple):
     frame_of: Indices
     directions: Array
     variances: Array
+    log_flux: Array
     track: Indices
 
 
@@ -157,6 +165,7 @@ class _ChainScratch(NamedTuple):
 
     u, w, bend, P : (3,), (3,), (3,), (SIZE,) float, state of the filter, see `sky_filter`
     ahead : (3,) float, a predicted direction
+    brightness : (3,) float, see `brightness`
     members : (longest,) int64, detections, newest first
     """
 
@@ -165,6 +174,7 @@ class _ChainScratch(NamedTuple):
     bend: Array
     P: Array
     ahead: Array
+    brightness: Array
     members: Indices
 
 
@@ -231,28 +241,33 @@ def _max_evidence(f, g, times, density, variance, class_rates, occurring):
 
 
 @kernel
-def _nearest_free(u, variance, detections, recent, slot, gate2):
-    """Return the free detection of a frame nearest to u (3,), by chi-square, and that chi-square.
+def _nearest_free(u, variance, brightness, detections, recent, slot, gate2):
+    """Return the free detection of a frame that fits u (3,) and `brightness` (3,) best, and the
+    chi-squares of its direction and its flux.
 
-    NONE and `gate2` if no free detection is within the gate. `variance` [rad^2] is that of u,
-    `slot` that of the frame in `recent`.
+    NONE if no free detection is within the gate. `variance` [rad^2] is that of u, `slot` that of
+    the frame in `recent`; brightness is that of a track.
     """
     directions, variances, track = detections.directions, detections.variances, detections.track
     start, items = recent.grids[2], recent.grids[3]
     reach = np.sqrt(gate2 * (variance + recent.largest[slot]))
     x_from, x_to, y_from, y_to, side = window(recent.grids, slot, u, reach)
-    best, best_chi2 = NONE, gate2
+    best, best_chi2, best_unlike = NONE, gate2, 0.0
     if x_from > x_to:
-        return best, best_chi2
+        return best, best_chi2, best_unlike
+    lowest = gate2  # sum of both chi-squares; the gate is of the direction alone
     for y in range(y_from, y_to + 1):
         for k in range(start[slot, y * side + x_from], start[slot, y * side + x_to + 1]):
             j = items[slot, k]
             if track[j] != NONE:
                 continue
             chi2 = distance2(directions[j], u) / (variance + variances[j])
-            if chi2 < best_chi2:
-                best, best_chi2 = j, chi2
-    return best, best_chi2
+            if chi2 >= min(gate2, lowest):
+                continue
+            unlike = brightness_chi2(brightness, detections.log_flux[j])
+            if best == NONE or chi2 + unlike < lowest:
+                best, best_chi2, best_unlike, lowest = j, chi2, unlike, chi2 + unlike
+    return best, best_chi2, best_unlike
 
 
 @kernel
@@ -273,13 +288,16 @@ def _extrapolate(u_f, u_g, chord2, ratio, out):
 
 @kernel
 def _chain_back(pair, detections, recent, rule, frames, best, wanted, scratch):
-    """Follow a pair back in time; return the number of detections and the log-evidence.
+    """Follow a pair back in time; return the number of detections, the log-evidence, and how much
+    the fluxes take from it.
 
     Writes the detections, newest first, to `scratch.members`. The evidence is the log-likelihood
     ratio of one moving object against false alarms, over all detections but the first two; with
     `frames.faint`, of an object that is detected in most frames or in few, whichever is likelier.
-    `frames` is the `_Evidence` of the pairs of both frames, `best` its row for the pair's rate. The
-    number is 0 if the evidence can no longer reach `wanted`.
+    What the fluxes take ranks chains and leaves the evidence as it is: an object of changing
+    brightness begins a track as soon. `frames` is the `_Evidence` of the pairs of both
+    frames, `best` its row for the pair's rate. The number is 0 if the evidence can no longer reach
+    `wanted`.
     """
     f, j, g, i = pair.f, pair.j, pair.g, pair.i
     times, directions, variances = detections.times, detections.directions, detections.variances
@@ -288,18 +306,21 @@ def _chain_back(pair, detections, recent, rule, frames, best, wanted, scratch):
         directions[j], times[f], variances[j], directions[i], times[g], variances[i], u, w, bend, P
     )
     scratch.members[0], scratch.members[1] = j, i
+    begin_brightness(scratch.brightness)
+    learn_brightness(scratch.brightness, detections.log_flux[j])
+    learn_brightness(scratch.brightness, detections.log_flux[i])
     n, at = 2, times[g]
     bright, dim = (f - g - 1) * LOG_MISS, -np.inf
     if frames.faint:
         dim = LOG_FAINT + (f - g - 1) * LOG_FAINT_MISS
     # Misses beyond the oldest detection count only if an older one follows: the object may have
     # entered the field there.
-    misses = 0
+    misses, taken = 0, 0.0
     for k in range(len(best) - 1):
         evidence = max(bright, dim)
         bright_after, dim_after = bright + misses * LOG_MISS, dim + misses * LOG_FAINT_MISS
         if max(evidence, max(bright_after, dim_after) + best[k]) < wanted:
-            return 0, evidence
+            return 0, evidence, taken
         if frames.faint and misses == MAX_FAINT_MISSES:
             break
         h = g - 1 - k
@@ -310,7 +331,9 @@ def _chain_back(pair, detections, recent, rule, frames, best, wanted, scratch):
         advance(u, w, bend, dt)
         at = times[h]
         slot = h % len(recent.largest)
-        m, chi2 = _nearest_free(u, P[0], detections, recent, slot, rule.gate2)
+        m, chi2, unlike = _nearest_free(
+            u, P[0], scratch.brightness, detections, recent, slot, rule.gate2
+        )
         if m == NONE:
             misses += 1
             continue
@@ -320,10 +343,12 @@ def _chain_back(pair, detections, recent, rule, frames, best, wanted, scratch):
             misses += 1
             continue
         bright, dim, misses = bright_after + gain, dim_after + LOG_FAINT_HIT + gain, 0
+        taken += 0.5 * unlike
         correct(u, w, bend, P, directions[m], variances[m])
+        learn_brightness(scratch.brightness, detections.log_flux[m])
         scratch.members[n] = m
         n += 1
-    return n, max(bright, dim)
+    return n, max(bright, dim), taken
 
 
 @kernel
@@ -390,7 +415,10 @@ def _may_chain(pair, detections, recent, rule, scratch):
     grow(P, np.sqrt(chord2) / dt, 0.0, -dt_back)
     _extrapolate(directions[j], directions[i], chord2, dt_back / dt, scratch.ahead)
     slot = (g - 1) % len(recent.largest)
-    m, _ = _nearest_free(scratch.ahead, P[0], detections, recent, slot, 1.02 * rule.gate2)
+    begin_brightness(scratch.brightness)
+    m, _, _ = _nearest_free(
+        scratch.ahead, P[0], scratch.brightness, detections, recent, slot, 1.02 * rule.gate2
+    )
     return m != NONE
 
 
@@ -411,9 +439,10 @@ def _try_pair(pair, detections, recent, rule, evidence, chains, scratch):
         and not _may_chain(pair, detections, recent, rule, scratch)
     ):
         return
-    n, gained = _chain_back(pair, detections, recent, rule, evidence, best, wanted, scratch)
-    if n >= rule.min_detections and gained > wanted:
-        chains.length[row], chains.strength[row] = n, gained - evidence.log_pairs
+    n, gained, taken = _chain_back(pair, detections, recent, rule, evidence, best, wanted, scratch)
+    strength = gained - taken - evidence.log_pairs
+    if n >= rule.min_detections and gained > wanted and strength > chains.strength[row]:
+        chains.length[row], chains.strength[row] = n, strength
         chains.members[row, :n] = scratch.members[:n]
 
 
@@ -428,6 +457,7 @@ def _try_pairs(f, g, reach, detections, recent, rule, evidence, chains):
         np.empty(3),
         np.empty(SIZE),
         np.empty(3),
+        np.empty(BRIGHTNESS_SIZE),
         np.empty(chains.members.shape[1], np.int64),
     )
     start, items = recent.grids[2], recent.grids[3]

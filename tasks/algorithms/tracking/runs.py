@@ -19,8 +19,15 @@ from typing import NamedTuple
 
 import numpy as np
 
-from epipole.schemas.arrays import Array, Integers
+from epipole.schemas.arrays import Array, Indices, Integers
 from epipole.tasks.algorithms.kernels import kernel
+from epipole.tasks.algorithms.tracking.brightness import SIZE as BRIGHTNESS_SIZE
+from epipole.tasks.algorithms.tracking.brightness import (
+    begin_brightness,
+    brightness_chi2,
+    learn_brightness,
+    log_flux,
+)
 from epipole.tasks.algorithms.tracking.common_motion import CommonMotion, common_motion
 from epipole.tasks.algorithms.tracking.initiation import (
     EXTRA_DETECTIONS,
@@ -53,6 +60,9 @@ MAX_PAIRS_OF_ALL, MIN_PAIRS = 20_000_000, 5_000
 # Accepted number of false tracks in a sequence. It counts every pair of detections as a test. Most
 # pairs are too fast to reach the evidence, so that 1 to 5 % of this number are measured.
 FALSE_ALARM_SEQUENCE = 1.0
+# A track's motion and brightness are not yet known well at this number of detections: with 6 or 20
+# as many are mixed; without limit, what was right after a crossing is exchanged as well.
+YOUNG = 10
 SHORT_SEQUENCE = 2  # a sequence is short up to twice the frames in which a track may begin
 # A track whose motion is known precisely goes on through more misses than `max_missed`: up to this
 # many frames, and while fewer false detections than this are expected in its gates.
@@ -67,6 +77,7 @@ class _Tracks(NamedTuple):
     """States of tracks.
 
     u, w, bend, P : (t, 3), (t, 3), (t, 3), (t, SIZE) float, see `sky_filter`
+    brightness : (t, 3) float, see `brightness`
     at, missed : (t,) float and int64, time of the state [s], and misses in a row
     strays : (t,) float, false detections expected in the gates since the last detection
     """
@@ -75,16 +86,46 @@ class _Tracks(NamedTuple):
     w: Array
     bend: Array
     P: Array
+    brightness: Array
     at: Array
     missed: Integers
     strays: Array
 
 
+class SkyDetections(NamedTuple):
+    """Detections of one sensor on the sky, frame after frame.
+
+    time_s : (f,) float
+        Frame times [s], increasing.
+    offsets : (f + 1,) int
+        Frame k has the detections ``offsets[k]:offsets[k + 1]``.
+    u_icrs : (n, 3) float
+        Directions, unit vectors.
+    sigma_rad : (n,) float
+        1-sigma error per axis, of centroid and attitude together [rad].
+    flux : (n,) float
+        In any unit; NaN where it is unknown. None: all are.
+    """
+
+    time_s: Array
+    offsets: Integers
+    u_icrs: Array
+    sigma_rad: Array
+    flux: Array | None = None
+
+    def take(self, rows: Indices) -> "SkyDetections":
+        """Return these detections, in ascending order, in the same frames."""
+        return SkyDetections(
+            self.time_s,
+            np.searchsorted(rows, self.offsets),
+            self.u_icrs[rows],
+            self.sigma_rad[rows],
+            None if self.flux is None else self.flux[rows],
+        )
+
+
 def follow_detections(
-    time_s: Array,
-    offsets: Integers,
-    u_icrs: Array,
-    sigma_rad: Array,
+    seen: SkyDetections,
     *,
     max_rate_rad_s: float,
     max_coast_s: float,
@@ -99,14 +140,6 @@ def follow_detections(
 
     Parameters
     ----------
-    time_s : (f,) float
-        Frame times [s], increasing, of one sensor.
-    offsets : (f + 1,) int
-        Frame k has the detections ``offsets[k]:offsets[k + 1]``.
-    u_icrs : (n, 3) float
-        Directions, unit vectors.
-    sigma_rad : (n,) float
-        1-sigma error per axis, of centroid and attitude together [rad].
     max_rate_rad_s, max_coast_s
         Maximum rate of an object, and maximum time between two frames of a track.
     max_missed
@@ -133,7 +166,7 @@ def follow_detections(
         Tracks count from 0 by the frame in which they were confirmed; those of the second time
         come last.
     """
-    max_per_frame = max(MAX_PAIRS_OF_ALL / max(len(time_s), 1), MIN_PAIRS)
+    max_per_frame = max(MAX_PAIRS_OF_ALL / max(len(seen.time_s), 1), MIN_PAIRS)
     rule = TrackRule(
         float(max_rate_rad_s),
         float(max_coast_s),
@@ -144,18 +177,17 @@ def follow_detections(
         -float(np.log(false_alarm)),
         float(min(max_per_frame, MAX_PAIRS)),
     )
-    detections = (time_s, offsets, u_icrs, sigma_rad)
-    track = _follow_by_rule(*detections, rule)
-    motion = common_motion(*detections, track)
+    track = _follow_by_rule(seen, rule)
+    motion = common_motion(*seen[:4], track)
     if motion is not None:
-        moving = _follow_free(*detections, _follow_in_motion(*detections, rule, motion), rule)
+        moving = _follow_free(seen, _follow_in_motion(seen, rule, motion), rule)
         # Confused tracks break: the better tracks hold more detections in fewer pieces.
         track = max(track, moving, key=lambda tracks: _explained(tracks, rule.min_detections))
-    n_frames = int(np.count_nonzero(np.diff(offsets)))
+    n_frames = int(np.count_nonzero(np.diff(seen.offsets)))
     if n_frames > SHORT_SEQUENCE * (rule.min_detections + EXTRA_DETECTIONS):
         return track
     per_frame = max(false_alarm, false_alarm_sequence / n_frames) if n_frames else false_alarm
-    return _follow_free(*detections, track, rule._replace(min_evidence=-float(np.log(per_frame))))
+    return _follow_free(seen, track, rule._replace(min_evidence=-float(np.log(per_frame))))
 
 
 def _explained(track: Integers, min_detections: int) -> int:
@@ -163,82 +195,58 @@ def _explained(track: Integers, min_detections: int) -> int:
     return int(np.count_nonzero(track != NONE)) - min_detections * (int(track.max(initial=-1)) + 1)
 
 
-def _follow_in_motion(
-    time_s: Array,
-    offsets: Integers,
-    u_icrs: Array,
-    sigma_rad: Array,
-    rule: TrackRule,
-    motion: CommonMotion,
-) -> Integers:
+def _follow_in_motion(seen: SkyDetections, rule: TrackRule, motion: CommonMotion) -> Integers:
     """Return the track number of every detection that moves as the common motion says."""
-    frame = np.repeat(np.arange(len(time_s)), np.diff(offsets))
-    return _follow_by_rule(
-        time_s / COMMON_FACTOR,
-        offsets,
-        np.einsum("nij,nj->ni", motion.rotation[frame], u_icrs),
-        sigma_rad,
-        rule._replace(
-            max_rate=max(COMMON_SHARE * motion.rate, COMMON_RATE) * COMMON_FACTOR,
-            max_coast=rule.max_coast / COMMON_FACTOR,
-        ),
+    frame = np.repeat(np.arange(len(seen.time_s)), np.diff(seen.offsets))
+    moving = seen._replace(
+        time_s=seen.time_s / COMMON_FACTOR,
+        u_icrs=np.einsum("nij,nj->ni", motion.rotation[frame], seen.u_icrs),
     )
+    slow = rule._replace(
+        max_rate=max(COMMON_SHARE * motion.rate, COMMON_RATE) * COMMON_FACTOR,
+        max_coast=rule.max_coast / COMMON_FACTOR,
+    )
+    return _follow_by_rule(moving, slow)
 
 
-def _follow_free(
-    time_s: Array,
-    offsets: Integers,
-    u_icrs: Array,
-    sigma_rad: Array,
-    track: Integers,
-    rule: TrackRule,
-) -> Integers:
+def _follow_free(seen: SkyDetections, track: Integers, rule: TrackRule) -> Integers:
     """Return the tracks with those of the detections that have none; these come last."""
     free = np.flatnonzero(track == NONE)
     if not len(free):
         return track
-    more = _follow_by_rule(
-        time_s, np.searchsorted(free, offsets), u_icrs[free], sigma_rad[free], rule
-    )
+    more = _follow_by_rule(seen.take(free), rule)
     out = track.copy()
     out[free] = np.where(more == NONE, NONE, more + track.max() + 1)
     return out
 
 
-def _follow_by_rule(
-    time_s: Array,
-    offsets: Integers,
-    u_icrs: Array,
-    sigma_rad: Array,
-    rule: TrackRule,
-) -> Integers:
+def _follow_by_rule(seen: SkyDetections, rule: TrackRule) -> Integers:
     """Return the track number of every detection, by one rule."""
-    n_in = np.diff(offsets)
+    n_in, n = np.diff(seen.offsets), len(seen.u_icrs)
     detections = Detections(
-        np.ascontiguousarray(time_s, float),
-        np.ascontiguousarray(offsets, np.int64),
+        np.ascontiguousarray(seen.time_s, float),
+        np.ascontiguousarray(seen.offsets, np.int64),
         np.repeat(np.arange(len(n_in)), n_in),
-        np.ascontiguousarray(u_icrs, float),
-        np.ascontiguousarray(sigma_rad, float) ** 2,
-        np.full(len(u_icrs), NONE),
+        np.ascontiguousarray(seen.u_icrs, float),
+        np.ascontiguousarray(seen.sigma_rad, float) ** 2,
+        np.full(n, np.nan) if seen.flux is None else log_flux(seen.flux),
+        np.full(n, NONE),
     )
-    _follow(detections, int(n_in.max(initial=0)), rule)
+    max_in_frame = int(n_in.max(initial=0))
+    if _follow(detections, max_in_frame, rule):
+        _retrace(detections, max_in_frame, rule)
     return detections.track
 
 
 @kernel
 def _follow(detections, max_in_frame, rule):
-    """Write each detection's track to `detections.track`; a frame has at most `max_in_frame`."""
-    times, capacity = detections.times, len(detections.track) // max(rule.min_detections, 1) + 1
-    tracks = _Tracks(
-        np.empty((capacity, 3)),
-        np.empty((capacity, 3)),
-        np.empty((capacity, 3)),
-        np.empty((capacity, SIZE)),
-        np.empty(capacity),
-        np.zeros(capacity, np.int64),
-        np.zeros(capacity),
-    )
+    """Write each detection's track to `detections.track`; a frame has at most `max_in_frame`.
+
+    Returns whether a detection of one track was in the gate of another.
+    """
+    times = detections.times
+    tracks = _empty_tracks(len(detections.track) // max(rule.min_detections, 1) + 1)
+    contested = False
     live = np.empty(0, np.int64)
     # Not the literal 0: `new_tracks` would be compiled for that type as well.
     n_tracks = len(live)
@@ -254,7 +262,7 @@ def _follow(detections, max_in_frame, rule):
         live = live[
             ((missed <= rule.max_missed) | is_sure) & (times[f] - tracks.at[live] <= rule.max_coast)
         ]
-        _assign(f, live, tracks, detections, recent, rule)
+        contested |= _assign(f, live, tracks, detections, recent, rule)
         began, length, chains = new_tracks(
             f, rule.min_detections + SLACK_FRAMES, n_tracks, detections, recent, rule
         )
@@ -262,10 +270,92 @@ def _follow(detections, max_in_frame, rule):
             members = chains[row, : length[row]]
             u, w, bend, P = tracks.u, tracks.w, tracks.bend, tracks.P
             _state_of(members, detections, u[n_tracks], w[n_tracks], bend[n_tracks], P[n_tracks])
+            begin_brightness(tracks.brightness[n_tracks])
+            for j in members[::-1]:
+                learn_brightness(tracks.brightness[n_tracks], detections.log_flux[j])
             tracks.at[n_tracks], tracks.missed[n_tracks] = times[f], 0
             tracks.strays[n_tracks] = 0.0
             n_tracks += 1
         live = np.concatenate((live, np.arange(n_tracks - len(began), n_tracks)))
+    return contested
+
+
+@kernel
+def _empty_tracks(n):
+    """Return n tracks whose states are not yet set."""
+    return _Tracks(
+        np.empty((n, 3)),
+        np.empty((n, 3)),
+        np.empty((n, 3)),
+        np.empty((n, SIZE)),
+        np.empty((n, BRIGHTNESS_SIZE)),
+        np.empty(n),
+        np.zeros(n, np.int64),
+        np.zeros(n),
+    )
+
+
+@kernel
+def _retrace(detections, max_in_frame, rule):
+    """Follow all tracks back in time, and exchange detections where both tracks then fit better.
+
+    Where co-located objects are mixed, it is at the beginning of their tracks: motion and
+    brightness are known later. Changes `detections.track`; a frame has at most `max_in_frame`.
+    """
+    times, offsets, track = detections.times, detections.offsets, detections.track
+    tracks = _empty_tracks(track.max() + 1)
+    last = np.full(track.max() + 1, NONE)  # detection of a track that has no state yet
+    left = np.zeros(track.max() + 1, np.int64)  # detections of a track that are not yet retraced
+    for m in track:
+        if m != NONE:
+            left[m] += 1
+    tracks.missed[:] = NONE
+    recent = RecentFrames(make_grids(1, max_in_frame), np.full(1, np.inf), np.zeros(1))
+    for f in range(len(times) - 1, -1, -1):
+        _fill_frame(f, detections, recent)
+        rows = np.arange(offsets[f], offsets[f + 1])
+        rows = rows[track[rows] != NONE]
+        rows = rows[np.argsort(track[rows])]
+        moving = np.empty(len(rows), np.int64)
+        n = 0
+        for j in rows:
+            m = track[j]
+            if tracks.missed[m] == 0:
+                moving[n] = j
+                n += 1
+            elif last[m] == NONE:
+                last[m] = j
+            elif times[detections.frame_of[last[m]]] > times[f]:
+                _begin_back(tracks, m, detections, last[m], j)
+        moving = moving[:n]
+        live = track[moving]
+        _move(tracks, live, times[f])
+        member, detection, chi2 = _candidates(f, live, tracks, detections, recent, rule)
+        other = track[detection]
+        young = (other != NONE) & ((left[member] <= YOUNG) | (left[other] <= YOUNG))
+        row = np.searchsorted(live, member[young])
+        _exchange(
+            live, tracks, detections, (row, detection[young], chi2[young]), moving, rule.gate2
+        )
+        for q in range(n):
+            _correct(tracks, live[q], detections, moving[q])
+        left[track[rows]] -= 1
+
+
+@kernel
+def _begin_back(tracks, m, detections, newer, older):
+    """Set the state of track m at the older of two detections."""
+    times, frame_of = detections.times, detections.frame_of
+    directions, variances = detections.directions, detections.variances
+    begin(
+        directions[newer], times[frame_of[newer]], variances[newer],
+        directions[older], times[frame_of[older]], variances[older],
+        tracks.u[m], tracks.w[m], tracks.bend[m], tracks.P[m],
+    )  # fmt: skip
+    begin_brightness(tracks.brightness[m])
+    learn_brightness(tracks.brightness[m], detections.log_flux[newer])
+    learn_brightness(tracks.brightness[m], detections.log_flux[older])
+    tracks.at[m], tracks.missed[m] = times[frame_of[older]], 0
 
 
 @kernel
@@ -282,14 +372,10 @@ def _assign(f, live, tracks, detections, recent, rule):
     """Move the live tracks to frame f, give them its detections and correct them.
 
     `live` (l,) int64 are rows of `tracks`, ascending. Writes `tracks` and `detections.track`.
+    Returns whether a detection of one track is in the gate of another.
     """
-    u, w, bend, P = tracks.u, tracks.w, tracks.bend, tracks.P
-    time = detections.times[f]
+    _move(tracks, live, detections.times[f])
     for m in live:
-        dt = time - tracks.at[m]
-        grow(P[m], rate_of(w[m]), rate_of(bend[m]), dt)
-        advance(u[m], w[m], bend[m], dt)
-        tracks.at[m] = time
         tracks.missed[m] += 1
     track, detection, chi2 = _candidates(f, live, tracks, detections, recent, rule)
     row = np.searchsorted(live, track)
@@ -299,13 +385,35 @@ def _assign(f, live, tracks, detections, recent, rule):
         if assigned[q] == NONE and detections.track[j] == NONE:
             assigned[q] = j
             detections.track[j] = track[p]
-    _exchange(live, tracks, detections, (row, detection, chi2), assigned, rule.gate2)
+    contested = _exchange(live, tracks, detections, (row, detection, chi2), assigned, rule.gate2)
     for q in range(len(live)):
         m, j = live[q], assigned[q]
         if j == NONE:
             continue
         tracks.missed[m], tracks.strays[m] = 0, 0.0
-        correct(u[m], w[m], bend[m], P[m], detections.directions[j], detections.variances[j])
+        _correct(tracks, m, detections, j)
+    return contested
+
+
+@kernel
+def _move(tracks, live, time):
+    """Move the states of the live tracks, rows of `tracks`, to a time [s]."""
+    u, w, bend, P = tracks.u, tracks.w, tracks.bend, tracks.P
+    for m in live:
+        dt = time - tracks.at[m]
+        grow(P[m], rate_of(w[m]), rate_of(bend[m]), dt)
+        advance(u[m], w[m], bend[m], dt)
+        tracks.at[m] = time
+
+
+@kernel
+def _correct(tracks, m, detections, j):
+    """Update the state of track m by detection j."""
+    correct(
+        tracks.u[m], tracks.w[m], tracks.bend[m], tracks.P[m],
+        detections.directions[j], detections.variances[j],
+    )  # fmt: skip
+    learn_brightness(tracks.brightness[m], detections.log_flux[j])
 
 
 @kernel
@@ -323,7 +431,7 @@ def _candidates(f, live, tracks, detections, recent, rule):
     track, detection = np.empty(capacity, np.int64), np.empty(capacity, np.int64)
     chi2 = np.empty(capacity)
     for m in live if n_in else live[:0]:
-        variance = tracks.P[m, 0]
+        variance, brightness = tracks.P[m, 0], tracks.brightness[m]
         gate2 = _gate2(variance + recent.smallest[slot], density, rule)
         if not gate2 > 0.0:
             tracks.strays[m] = np.inf
@@ -344,7 +452,8 @@ def _candidates(f, live, tracks, detections, recent, rule):
                     detection = np.concatenate((detection, np.empty(capacity, np.int64)))
                     chi2 = np.concatenate((chi2, np.empty(capacity)))
                     capacity *= 2
-                track[count], detection[count], chi2[count] = m, j, distance
+                unlike = brightness_chi2(brightness, detections.log_flux[j])
+                track[count], detection[count], chi2[count] = m, j, distance + unlike
                 count += 1
     return track[:count], detection[:count], chi2[:count]
 
@@ -377,25 +486,34 @@ def _exchange(live, tracks, detections, candidates, assigned, gate2):
     Predictions of neighbours may all be off to one side. Then the nearest detection is often the
     neighbour's. `candidates` are row in `live`, detection and chi-square, (c,) each; `assigned`
     (len(live),) the detection of each live track. Changes `assigned` and `detections.track`.
+    Returns whether a detection of one track is in the gate of another.
     """
     row, detection, chi2 = candidates
+    contested = False
     for p in range(len(row)):
         q, k = row[p], detection[p]
         j, other = assigned[q], detections.track[k]
         if j in (NONE, k) or other == NONE:
             continue
+        at = np.searchsorted(live, other)
+        if at == len(live) or live[at] != other:
+            continue
+        contested = True
         now = _chi2(tracks, live[q], detections, j) + _chi2(tracks, other, detections, k)
         back = _chi2(tracks, other, detections, j)
-        if back < gate2 and chi2[p] + back < now:
-            assigned[q], assigned[np.searchsorted(live, other)] = k, j
+        unlike = brightness_chi2(tracks.brightness[other], detections.log_flux[j])
+        if back - unlike < gate2 and chi2[p] + back < now:
+            assigned[q], assigned[at] = k, j
             detections.track[k], detections.track[j] = live[q], other
+    return contested
 
 
 @kernel
 def _chi2(tracks, m, detections, j):
-    """Return chi-square of detection j, 2 degrees of freedom, as one of track m."""
+    """Return chi-square of detection j as one of track m: of its direction and of its flux."""
     variance = tracks.P[m, 0] + detections.variances[j]
-    return distance2(detections.directions[j], tracks.u[m]) / variance
+    unlike = brightness_chi2(tracks.brightness[m], detections.log_flux[j])
+    return distance2(detections.directions[j], tracks.u[m]) / variance + unlike
 
 
 @kernel

@@ -76,6 +76,7 @@ def scene(seed, *, times, rate_arcsec_s, n_objects=2, n_strays=2, missed=0.1, er
         frame_of=np.repeat(np.arange(len(times)), np.diff(offsets)),
         directions=u / np.linalg.norm(u, axis=1, keepdims=True),
         variances=np.concatenate(sigma) ** 2,
+        log_flux=np.full(len(u), np.nan),
         track=track,
     )
 

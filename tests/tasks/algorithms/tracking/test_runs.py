@@ -6,7 +6,7 @@ from scenes.few_frames import FIELD_RAD, INTERVAL_S, few_frames, found_and_false
 
 from epipole.tasks.algorithms.constants import ARCSEC
 from epipole.tasks.algorithms.geometry.directions import tangent_basis
-from epipole.tasks.algorithms.tracking.runs import follow_detections
+from epipole.tasks.algorithms.tracking.runs import SkyDetections, follow_detections
 
 FIELD = np.radians(4.0)
 SIGMA = 2 * ARCSEC
@@ -52,7 +52,8 @@ def follow(times, offsets, u, sigma=SIGMA, **changes):
         "field_sr": FIELD**2,
         "false_alarm": 1e-4,
     }
-    return follow_detections(times, offsets, u, np.full(len(u), sigma), **options | changes)
+    seen = SkyDetections(times, offsets, u, np.full(len(u), sigma))
+    return follow_detections(seen, **options | changes)
 
 
 def score(track, who):
