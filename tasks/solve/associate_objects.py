@@ -73,7 +73,7 @@ def associate_objects(
     agreeing[np.concatenate([np.zeros(0, np.int64), *left_out])] = False
     rejects = [_reject_table(block, Reason.SENSOR_DISAGREES, rows) for rows in left_out]
     if settings.method == "likelihood":
-        _associate_longer(block, window_groups, agreeing, settings)
+        _associate_longer(block, windows, window_groups, agreeing, settings)
         window_groups.continue_groups(agreeing, BRIEFLY * settings.window_s)
     numbered = _number_objects(block, window_groups.group, windows)
     number = main_objects(block.track[items.tracklet], numbered, items.n_views)
@@ -162,13 +162,19 @@ def _warn_about(sensors: npt.NDArray[np.str_]) -> None:
 
 
 def _associate_longer(
-    block: BlockViews, window_groups: WindowGroups, agreeing: Flags, settings: AssociationSettings
+    block: BlockViews,
+    windows: list[Indices],
+    window_groups: WindowGroups,
+    agreeing: Flags,
+    settings: AssociationSettings,
 ) -> None:
-    """Associate undecided tracklets again, over longer windows."""
+    """Associate tracklets again over longer windows: undecided ones, and those of groups in which
+    a tracklet is not with the object that it mostly is."""
     window_before_s = settings.window_s
     for window_s in LONGER_WINDOWS_S:
         if not window_before_s < window_s <= settings.max_window_s:
             continue
+        window_groups.doubt(_changing(block, window_groups.group, windows))
         longer = block.items.first_ns // round(window_s * 1e9)
         for number in np.unique(longer[agreeing]).tolist():
             rows = np.flatnonzero((longer == number) & agreeing)
@@ -178,6 +184,17 @@ def _associate_longer(
                 groups = _find_groups(block, samples, settings)
                 window_groups.reconsider(rows, again, tracklet, groups)
         window_before_s = window_s
+
+
+def _changing(block: BlockViews, group: Indices, windows: list[Indices]) -> Indices:
+    """Return the items that are of another object than their tracklet mostly is.
+
+    In a window with one detection per sensor, the tracklets of two co-located objects may be
+    confused.
+    """
+    items = block.items
+    number = _number_objects(block, group, windows)
+    return np.flatnonzero((number >= 0) & ~_in_main(items.tracklet, number, items.n_views))
 
 
 def _long_samples(
@@ -216,6 +233,12 @@ def main_objects(track: Indices, number: Indices, n_views: Indices) -> Indices:
     The main object of a track has the most of its views. Other objects of it are pieces of that
     one, or mix tracks of several objects for a moment.
     """
+    main = np.unique(number[_in_main(track, number, n_views)])
+    return np.where(np.isin(number, main), number, -1)
+
+
+def _in_main(track: Indices, number: Indices, n_views: Indices) -> Flags:
+    """Return which items are in the main object of their track: (n,) bool."""
     inside = np.flatnonzero(number >= 0)
     pairs, pair = np.unique(
         np.column_stack([track[inside], number[inside]]), axis=0, return_inverse=True
@@ -223,8 +246,9 @@ def main_objects(track: Indices, number: Indices, n_views: Indices) -> Indices:
     count = np.bincount(pair.ravel(), n_views[inside], minlength=len(pairs))
     most = np.zeros(track.max(initial=-1) + 1)
     np.maximum.at(most, pairs[:, 0], count)
-    main = pairs[count >= most[pairs[:, 0]], 1]
-    return np.where(np.isin(number, main), number, -1)
+    out = np.zeros(len(number), bool)
+    out[inside] = (count >= most[pairs[:, 0]])[pair.ravel()]
+    return out
 
 
 def _find_groups(block: BlockViews, samples: Samples, settings: AssociationSettings) -> Groups:

@@ -65,6 +65,11 @@ class WindowGroups:
         self.group[rows] = FREE
         self.ambiguous[rows] = self.undecided[rows] = False
 
+    def doubt(self, rows: Indices) -> None:
+        """Let the groups of some items be uncertain."""
+        groups = self.group[rows]
+        self._score[groups[groups != FREE]] = -np.inf
+
     def continue_groups(self, allowed: Flags, briefly_s: float) -> None:
         """Let the tracklets of a group stay together in neighbouring windows.
 

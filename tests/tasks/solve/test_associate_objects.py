@@ -5,6 +5,7 @@ import pytest
 from scenes.associations import associated, reasons, wrong_views
 from scenes.tracklet_scenes import Scene
 
+from epipole.tasks.solve import associate_objects as associate
 from epipole.tasks.solve.associate_objects import main_objects
 
 
@@ -112,6 +113,21 @@ def test_tracklets_that_two_objects_explain_are_ambiguous():
     found = associated(scene)
     assert found.views.num_rows == 0
     assert reasons(found) == {"ambiguous": 4}
+
+
+def co_located(seed):
+    """Return three objects about 4 km apart that four sensors see once in each window."""
+    scene = Scene(seed, 4, sigma_arcsec=8.0, times=np.arange(15.0, 600.0, 30.0))
+    return scene.objects(3, spread_km=4.0)
+
+
+def test_tracklets_that_a_window_confuses_are_decided_over_longer_ones(monkeypatch):
+    found = [associated(co_located(seed)) for seed in range(4)]
+    assert sum(wrong_views(co_located(k), each) for k, each in enumerate(found)) == 0
+    assert all(len(np.unique(each.object_number)) == 3 for each in found)
+    monkeypatch.setattr(associate, "_changing", lambda *_: np.zeros(0, np.int64))
+    found = [associated(co_located(seed)) for seed in range(4)]
+    assert sum(wrong_views(co_located(k), each) for k, each in enumerate(found)) > 0
 
 
 def test_an_object_that_is_the_main_one_of_no_track_is_none():

@@ -61,6 +61,12 @@ def test_a_sure_group_is_not_judged_again_where_it_is_sure():
     assert len(unsure) == 10
 
 
+def test_a_sure_group_that_is_doubted_is_judged_again():
+    verdicts = entered(score=9.0)
+    verdicts.doubt(np.arange(10))
+    assert len(verdicts.to_decide_again(np.arange(10), 30.0)) == 10
+
+
 def test_tracklets_that_do_not_continue_keep_their_verdict():
     assert not len(entered(score=3.0).to_decide_again(np.arange(4), 30.0))  # 50 s < 2 x 30 s
 
