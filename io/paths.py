@@ -24,6 +24,7 @@ from epipole.schemas.text import without_secrets
 # Linux starts no process with a variable of 128 KiB.
 SECRETS = "EPIPOLE_URLS"
 MAX_SECRETS_BYTES = 100_000
+BUCKETS = ("s3", "s3a", "gs", "gcs")  # schemes whose URLs begin with a bucket
 
 
 def known_as(where: str) -> str:
@@ -84,6 +85,8 @@ def file_system(where: str) -> tuple[Any, str]:
     parts, options = urlsplit(given), {}  # raises for an invalid URL, such as http://[::1
     if parts.scheme in ("http", "https"):
         return fsspec.filesystem(parts.scheme), given  # fsspec itself takes :: for something else
+    if parts.scheme in BUCKETS and not parts.hostname:
+        raise ValueError(f"the URL has no bucket; write {parts.scheme}://BUCKET/PATH")
     if parts.scheme in ("s3", "s3a") and "@" in parts.netloc:
         options = {"key": unquote(parts.username or ""), "secret": unquote(parts.password or "")}
         given = without_secrets(given)

@@ -110,7 +110,7 @@ def offsets_in_sigmas(seed, noise, turn_noise):
 
 @pytest.mark.parametrize(("noise", "turn_noise"), [(6.0, 0.0), (3.0, 3.0)])
 def test_what_lines_of_the_same_frames_share_is_not_counted_as_independent(noise, turn_noise):
-    found = [offsets_in_sigmas(k, noise * SIGMA, turn_noise * SIGMA) for k in range(40)]
+    found = [offsets_in_sigmas(k, noise * SIGMA, turn_noise * SIGMA) for k in range(20)]
     assert 0.8 < np.sqrt(np.mean(np.square(found))) < 1.2
 
 

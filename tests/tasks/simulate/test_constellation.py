@@ -215,7 +215,7 @@ def test_a_trail_widens_the_error_along_the_motion_only():
     sensor = SENSOR | {
         "pointing": {"mode": "body", "azimuth_deg": 60.0, "elevation_deg": 20.0},
         "camera": {"fov_deg": 120.0}, "exposure_s": 0.5,
-        "rate_hz": 200.0,
+        "rate_hz": 200.0, "magnitude_limit": 4.0,
     }  # fmt: skip
     places = {}
     for error in (0.0, 0.1):
