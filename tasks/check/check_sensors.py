@@ -283,7 +283,8 @@ def _fits_per_detection(rows: pl.DataFrame) -> Array:
     """Return in how many lines of a tracklet the detections of each line are fitted: (n,)."""
     tracklet = rows.select(pl.struct("sensor_id", "tracklet_id").rank("dense")).to_series()
     start = rows["first_fitted"].min()
-    # In microseconds, so that a tracklet's rank and a time in the night are one integer.
+    # A tracklet's rank and a time, in microseconds, are one integer: no night, with what was read
+    # around it, lasts four days.
     first, last = (
         tracklet.cast(pl.Int64) * (4 * DAY_NS // 1000)
         + (rows[name] - start).dt.total_microseconds()

@@ -232,10 +232,18 @@ def _follow_by_rule(seen: SkyDetections, rule: TrackRule) -> Integers:
         np.full(n, np.nan) if seen.flux is None else log_flux(seen.flux),
         np.full(n, NONE),
     )
-    max_in_frame = int(n_in.max(initial=0))
+    _follow_and_retrace(detections, int(n_in.max(initial=0)), rule)
+    return detections.track
+
+
+@kernel
+def _follow_and_retrace(detections, max_in_frame, rule):
+    """Write each detection's track to `detections.track`; a frame has at most `max_in_frame`.
+
+    One kernel for Python: so both are compiled with it, also where no run retraces.
+    """
     if _follow(detections, max_in_frame, rule):
         _retrace(detections, max_in_frame, rule)
-    return detections.track
 
 
 @kernel
@@ -303,13 +311,10 @@ def _retrace(detections, max_in_frame, rule):
     brightness are known later. Changes `detections.track`; a frame has at most `max_in_frame`.
     """
     times, offsets, track = detections.times, detections.offsets, detections.track
-    tracks = _empty_tracks(track.max() + 1)
-    last = np.full(track.max() + 1, NONE)  # detection of a track that has no state yet
-    left = np.zeros(track.max() + 1, np.int64)  # detections of a track that are not yet retraced
-    for m in track:
-        if m != NONE:
-            left[m] += 1
-    tracks.missed[:] = NONE
+    n_tracks = track.max() + 1
+    tracks, has_state = _empty_tracks(n_tracks), np.zeros(n_tracks, np.bool_)
+    last = np.full(n_tracks, NONE)  # detection of a track that has no state yet
+    left = np.bincount(track[track != NONE])  # detections of a track that are not yet retraced
     recent = RecentFrames(make_grids(1, max_in_frame), np.full(1, np.inf), np.zeros(1))
     for f in range(len(times) - 1, -1, -1):
         _fill_frame(f, detections, recent)
@@ -320,13 +325,14 @@ def _retrace(detections, max_in_frame, rule):
         n = 0
         for j in rows:
             m = track[j]
-            if tracks.missed[m] == 0:
+            if has_state[m]:
                 moving[n] = j
                 n += 1
             elif last[m] == NONE:
                 last[m] = j
             elif times[detections.frame_of[last[m]]] > times[f]:
                 _begin_back(tracks, m, detections, last[m], j)
+                has_state[m] = True
         moving = moving[:n]
         live = track[moving]
         _move(tracks, live, times[f])
@@ -355,7 +361,7 @@ def _begin_back(tracks, m, detections, newer, older):
     begin_brightness(tracks.brightness[m])
     learn_brightness(tracks.brightness[m], detections.log_flux[newer])
     learn_brightness(tracks.brightness[m], detections.log_flux[older])
-    tracks.at[m], tracks.missed[m] = times[frame_of[older]], 0
+    tracks.at[m] = times[frame_of[older]]
 
 
 @kernel
@@ -501,8 +507,8 @@ def _exchange(live, tracks, detections, candidates, assigned, gate2):
         contested = True
         now = _chi2(tracks, live[q], detections, j) + _chi2(tracks, other, detections, k)
         back = _chi2(tracks, other, detections, j)
-        unlike = brightness_chi2(tracks.brightness[other], detections.log_flux[j])
-        if back - unlike < gate2 and chi2[p] + back < now:
+        in_gate = _direction_chi2(tracks, other, detections, j) < gate2
+        if in_gate and chi2[p] + back < now:
             assigned[q], assigned[at] = k, j
             detections.track[k], detections.track[j] = live[q], other
     return contested
@@ -511,9 +517,15 @@ def _exchange(live, tracks, detections, candidates, assigned, gate2):
 @kernel
 def _chi2(tracks, m, detections, j):
     """Return chi-square of detection j as one of track m: of its direction and of its flux."""
-    variance = tracks.P[m, 0] + detections.variances[j]
     unlike = brightness_chi2(tracks.brightness[m], detections.log_flux[j])
-    return distance2(detections.directions[j], tracks.u[m]) / variance + unlike
+    return _direction_chi2(tracks, m, detections, j) + unlike
+
+
+@kernel
+def _direction_chi2(tracks, m, detections, j):
+    """Return chi-square of the direction of detection j, 2 degrees of freedom, for track m."""
+    variance = tracks.P[m, 0] + detections.variances[j]
+    return distance2(detections.directions[j], tracks.u[m]) / variance
 
 
 @kernel

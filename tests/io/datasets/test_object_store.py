@@ -169,7 +169,7 @@ def publish_and_be_killed(out, limit):
     )
 
 
-@pytest.mark.parametrize("share", [0.1, 0.48, 0.53, 0.99])
+@pytest.mark.parametrize("share", [0.1, 0.48, 0.53, 0.8, 0.99])
 def test_a_publisher_killed_at_any_write_has_published_both_nights_or_none(s3, out, share):
     n_writes = 2 + 2 * len(TABLES) + 1 + 2 * len(TABLES) + 2
     publish(out, night_tables(OVER_MIDNIGHT[:8]), [NIGHT])
@@ -191,7 +191,7 @@ def test_a_publisher_killed_at_any_write_has_published_both_nights_or_none(s3, o
         assert len([p for p in s3.find(out) if NEXT_NIGHT in p]) == len(TABLES)
 
 
-@pytest.mark.parametrize("share", [0.02, 0.5, 0.95])
+@pytest.mark.parametrize("share", [0.02, 0.3, 0.5, 0.7, 0.95])
 def test_a_store_that_refuses_a_write_ends_in_one_line_and_no_half_night(
     s3, out, share, monkeypatch
 ):

@@ -84,7 +84,7 @@ def test_co_located_satellites_of_unlike_brightness_are_rarely_mixed(apart_km, e
 def test_what_is_mixed_at_the_beginning_is_exchanged_afterwards(monkeypatch):
     these = scenes(1.0, 2.0, 60)
     after = sum(wrong(followed(s, k, 0.1), s[3]) for k, s in enumerate(these))
-    monkeypatch.setattr(runs, "_retrace", lambda *_: None)
+    monkeypatch.setattr(runs, "_follow_and_retrace", runs._follow)
     before = sum(wrong(followed(s, k, 0.1), s[3]) for k, s in enumerate(these))
     assert before > 10
     assert after < 0.5 * before
