@@ -123,6 +123,12 @@ def test_no_message_has_the_secrets_of_a_url(server, no_early_server):
             assert "epipole: " in printed
 
 
+def test_a_url_without_a_bucket_is_refused_before_its_store_is_asked(no_early_server):
+    code, printed = epipole("info", f"s3://me:{PASSWORD}@/a.mcap")
+    assert code == 1
+    assert "s3:///a.mcap: cannot be read: the URL has no bucket; write s3://BUCKET/PATH" in printed
+
+
 def test_info_names_the_log_without_its_secrets(server):
     code, printed = epipole("info", "--json", f"http://x:{PASSWORD}@{server}/night.mcap?t={TOKEN}")
     assert code == 0, printed
