@@ -6,6 +6,7 @@ from pathlib import Path
 from urllib.parse import quote
 
 from epipole.flows.night.reports import night_facts
+from epipole.flows.night.run_records import read_records
 from epipole.io.datasets.dataset import night_row, nights_in, report_location
 from epipole.io.paths import fault_of_name, file_system, storage_errors
 from epipole.schemas.errors import DatasetError, ReportError
@@ -44,7 +45,7 @@ def _calendar(dataset: str, nights: list[str], out: Path) -> str:
 
     if not nights:
         raise DatasetError(f"{dataset}: has no night")
-    found = []
+    found, records = [], read_records(dataset, nights)
     for night in nights:
         try:
             row = night_row(dataset, night)
@@ -53,7 +54,8 @@ def _calendar(dataset: str, nights: list[str], out: Path) -> str:
         page = report_location(dataset, night)
         said = VERDICT.search(_head_of(page))
         address = _address(page, out) if said else ""
-        found.append(CalendarNight(night, row, said[1] if said else "", address))
+        looks = records[night]["needs_look"] if night in records else []
+        found.append(CalendarNight(night, row, looks, said[1] if said else "", address))
     return calendar_page(dataset, found)
 
 

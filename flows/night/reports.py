@@ -8,7 +8,7 @@ from pathlib import Path
 
 from epipole.flows.night.run_records import new_broken_logs
 from epipole.flows.night.summary import Summary
-from epipole.io.datasets.dataset import night_reader, nights_in, write_beside
+from epipole.io.datasets.dataset import night_reader, nights_in, remove_beside, write_beside
 from epipole.io.datasets.local import REPORTS
 from epipole.io.datasets.night_tables import NightReader
 from epipole.io.paths import line_of
@@ -26,6 +26,8 @@ LOGGER = logging.getLogger(__name__)
 
 def with_reports(summary: Summary, staged: Mapping[str, Path], write: bool) -> Summary:
     """Write the reports of published nights; return the summary with what needs a look.
+
+    Reports of the nights as they were before are removed, also where none is written.
 
     The nights are published: whatever happens here, the run has succeeded. So an error is a line,
     and the other nights have their reports.
@@ -48,6 +50,8 @@ def with_reports(summary: Summary, staged: Mapping[str, Path], write: bool) -> S
         return summary
     for night in summary.nights:
         try:
+            # It shows the night as it was before: until the new one is written there is none.
+            remove_beside(summary.dataset, REPORTS, f"{night}.html")
             folder = staged[night] if staged[night].is_dir() else None
             facts = night_facts(summary.dataset, night, nights, folder)
             broken = new_broken_logs(summary.dataset, night)

@@ -241,6 +241,19 @@ def write_beside(dataset: Where, folder: str, name: str, data: bytes) -> None:
             storage.write_beside(folder, name, data)
 
 
+def remove_beside(dataset: Where, folder: str, name: str) -> None:
+    """Remove a file in a folder beside the nights of a dataset, if it exists.
+
+    Raises
+    ------
+    DatasetError
+        Where it cannot be removed.
+    """
+    storage = night_storage(dataset)
+    with _writing(dataset, storage):
+        storage.remove_beside(folder, name)
+
+
 def read_beside(
     dataset: Where, folder: str, schema: pa.Schema, nights: Collection[str] | None = None
 ) -> list[dict[str, Any]]:

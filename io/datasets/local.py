@@ -197,6 +197,11 @@ class LocalNights:
         finally:
             Path(made).unlink(missing_ok=True)
 
+    def remove_beside(self, folder: str, name: str) -> None:
+        """Remove such a file, if it exists."""
+        refuse_link(self.folder / folder)
+        (self.folder / folder / name).unlink(missing_ok=True)
+
     def files_beside(self, folder: str, nights: Collection[str] | None = None) -> list[Path]:
         """Return the Parquet files in a folder beside the nights, in order; of all, or of some."""
         paths = sorted((self.folder / folder).absolute().glob("[!.]*.parquet"))

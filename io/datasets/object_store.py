@@ -272,6 +272,11 @@ class StoreNights:
         """Write one object."""
         self._storage.pipe_file(f"{self._root}/{folder}/{name}", data)
 
+    def remove_beside(self, folder: str, name: str) -> None:
+        """Remove such an object, if it exists."""
+        with contextlib.suppress(FileNotFoundError):
+            self._storage.rm_file(f"{self._root}/{folder}/{name}")
+
     def files_beside(
         self, folder: str, nights: Collection[str] | None = None
     ) -> list[pa.BufferReader]:

@@ -48,6 +48,9 @@ class NightStorage(Protocol):
     def write_beside(self, folder: str, name: str, data: bytes) -> None:
         """Write a file into a folder beside the nights, or replace it, at once."""
 
+    def remove_beside(self, folder: str, name: str) -> None:
+        """Remove such a file, if it exists."""
+
     def files_beside(self, folder: str, nights: Collection[str] | None = None) -> Sequence[Any]:
         """Return the Parquet files in a folder beside the nights, as pyarrow reads them.
 

@@ -31,18 +31,20 @@ class CalendarNight(NamedTuple):
     """A night of the calendar.
 
     row : of its table `nights`; None: it cannot be read
+    looks : what needs a look, as its run has recorded it
     verdict : as its page says, `WELL` or `LOOK`; '' without a page
     address : of its page, relative to the calendar; '' without one that a browser can open
     """
 
     date: str
     row: dict[str, Any] | None
+    looks: list[str]
     verdict: str
     address: str
 
 
 class JudgedNight(NamedTuple):
-    """A night, what is to be thought of it, and why; `counted`: by its counts, without its page."""
+    """A night, what is to be thought of it, and why; `counted`: it has no page that says so."""
 
     night: CalendarNight
     verdict: str
@@ -53,14 +55,14 @@ class JudgedNight(NamedTuple):
 def judge(nights: Sequence[CalendarNight]) -> list[JudgedNight]:
     """Return what is to be thought of each night.
 
-    Its page says so. A night without a page is judged by its table `nights`: sensors at fault, the
-    share of frames identified, and numbers below those of the nights before, by the limits of
-    the page.
+    Its page says so; without a page, the record of its run; without what needs a look there, its
+    table `nights`: sensors at fault, the share of frames identified, and numbers below those of the
+    nights before, by the limits of the page.
     """
     judged: list[JudgedNight] = []
     for k, night in enumerate(nights):
         before = [each.row for each in nights[max(k - USUAL_OF, 0) : k] if each.row]
-        reasons = _reasons(night.row, before)
+        reasons = night.looks or _reasons(night.row, before)
         by_counts = LOOK if reasons else WELL
         verdict = (night.verdict or by_counts) if night.row else ""
         judged.append(JudgedNight(night, verdict, reasons, not night.verdict))
@@ -91,7 +93,7 @@ def calendar_page(dataset: str, nights: Sequence[CalendarNight]) -> str:
     what = (
         f"Of the nights {counts[WELL]:,} are well (✓), {counts[LOOK]:,} need a look (!), "
         f"{counts['']:,} cannot be read (?). As the page of each night says; a "
-        "dashed night has no page, and is judged by its counts alone."
+        "dashed night has no page, and is judged by its run and its counts."
     )
     worst = [
         f"{each.night.date}: {'; '.join(each.reasons) or 'its page says why'}"

@@ -18,6 +18,7 @@ from epipole.schemas.errors import DatasetError, ReportError
 from epipole.schemas.settings import ReportSettings, Settings
 
 NIGHT = "2019-04-01"
+DRAWS = True
 WITHOUT = Settings(report=ReportSettings(write=False))
 
 
@@ -31,9 +32,15 @@ def test_a_run_writes_the_report_beside_its_nights(night_dataset, tmp_path):
     assert sorted(p.name for p in (tmp_path / "sub").iterdir()) == ["night.html"]
 
 
-def test_the_setting_changes_no_table(night_dataset, night_log, tmp_path):
+def test_the_setting_changes_no_table_and_leaves_no_report_of_an_earlier_run(
+    night_dataset, night_log, tmp_path
+):
+    pages = tmp_path / "out" / "reports"
+    pages.mkdir(parents=True)
+    for night in (NIGHT, "2019-03-31"):
+        (pages / f"{night}.html").write_text("as it was before")
     nightly([str(night_log)], str(tmp_path / "out"), settings=WITHOUT)
-    assert not (tmp_path / "out" / "reports").exists()
+    assert [page.name for page in pages.iterdir()] == ["2019-03-31.html"]
     night = f"night={NIGHT}"
     assert contents(tmp_path / "out" / night) == contents(night_dataset / night)
 

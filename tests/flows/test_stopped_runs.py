@@ -11,6 +11,7 @@ from scenes.killed_runs import PUBLISHING, Stop, StoppedRuns, make_logs
 
 pytestmark = pytest.mark.long
 
+DRAWS = True  # as the runs of the command do
 # The sixth change of a file: one night is in place, the other one is not.
 BETWEEN_NIGHTS = Stop(signal.SIGKILL, write=6, mark=PUBLISHING)
 

@@ -11,9 +11,10 @@ def row(**values):
     return {"left_out": 3} | usual | values
 
 
-def nights(*rows, verdict="", address=""):
+def nights(*rows, looks=(), verdict="", address=""):
     return [
-        CalendarNight(f"2019-04-{k + 1:02}", each, verdict, address) for k, each in enumerate(rows)
+        CalendarNight(f"2019-04-{k + 1:02}", each, list(looks), verdict, address)
+        for k, each in enumerate(rows)
     ]
 
 
@@ -31,6 +32,12 @@ def test_a_night_without_a_page_is_judged_by_its_counts():
     assert verdicts(nights(row(), None)) == [WELL, ""]
 
 
+def test_what_a_run_has_recorded_needs_a_look_without_a_page_too():
+    (judged,) = judge(nights(row(), looks=["sat1: no frames for 12 s"]))
+    assert (judged.verdict, judged.reasons) == (LOOK, ["sat1: no frames for 12 s"])
+    assert judged.counted
+
+
 def test_what_the_page_of_a_night_says_counts_more():
     (judged,) = judge(nights(row(identified=10), verdict=WELL))
     assert judged.verdict == WELL
@@ -38,8 +45,8 @@ def test_what_the_page_of_a_night_says_counts_more():
 
 
 def test_months_have_their_days_and_nights_their_colour_and_link():
-    found = [CalendarNight("2019-03-31", row(), LOOK, "reports/2019-03-31.html"),
-             CalendarNight("2019-04-01", row(), "", "")]  # fmt: skip
+    found = [CalendarNight("2019-03-31", row(), [], LOOK, "reports/2019-03-31.html"),
+             CalendarNight("2019-04-01", row(), [], "", "")]  # fmt: skip
     page = calendar_page("out", found)
     assert "March 2019" in page
     assert page.index("April 2019") < page.index("March 2019")
