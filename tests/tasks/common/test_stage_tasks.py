@@ -1,8 +1,10 @@
 """Tasks of a stage: named by it, their runs by what they work on, tried again only if asked."""
 
 import errno
+import sys
 
 import botocore.exceptions as s3
+import numpy as np
 import pytest
 from prefect import flow
 from prefect.states import Failed
@@ -12,6 +14,7 @@ from epipole.io.work.parts import read_part
 from epipole.io.work.work_layout import ReadFolder
 from epipole.schemas.errors import DatasetError, LogError
 from epipole.schemas.stages import Stage
+from epipole.tasks.common import stage_tasks
 from epipole.tasks.common.batches import Batch
 from epipole.tasks.common.stage_tasks import DELAYS_S, RETRIES, stage_task, storage_failed
 from epipole.tasks.read import read_logs as module
@@ -27,6 +30,20 @@ def test_a_task_has_the_name_of_its_stage(stage):
     assert work.name == stage.value
     assert work.task_run_name == f"{stage} {{sensor}} {{span}}"
     assert work.fn(1, 2) == (1, 2)
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="asks Linux for the memory")
+def test_a_process_that_has_grown_gives_back_what_it_has_freed():
+    stage_tasks.give_back_memory()
+    before = stage_tasks._resident_bytes()
+    rows = [np.ones(8_000) for _ in range(3_000)]
+    last = rows[-1]  # behind the others: without being asked, the allocator keeps what is free
+    del rows
+    grown = stage_tasks._resident_bytes() - before
+    assert grown > 2 * stage_tasks.MAX_GROWTH_BYTES
+    stage_tasks.give_back_memory()
+    assert stage_tasks._resident_bytes() - before < grown / 4
+    assert last.all()
 
 
 def test_only_tasks_that_ask_for_it_are_tried_again():
