@@ -36,6 +36,8 @@ def test_what_a_run_has_recorded_needs_a_look_without_a_page_too():
     (judged,) = judge(nights(row(), looks=["sat1: no frames for 12 s"]))
     assert (judged.verdict, judged.reasons) == (LOOK, ["sat1: no frames for 12 s"])
     assert judged.counted
+    (unread,) = judge(nights(None, looks=["sat1: no frames for 12 s"]))
+    assert unread.reasons == ["its table `nights` is missing or cannot be read"]
 
 
 def test_what_the_page_of_a_night_says_counts_more():
