@@ -58,15 +58,16 @@ def bench_build(folder: Path, repeats: int) -> None:
     for name, make in made.items():
         took = [cpu_ms(lambda: tables.update({name: make()})) for _ in range(repeats)]  # noqa: B023
         print(f"{name}: {tables[name].num_rows} stars, table made in {np.median(took):.0f} ms")
-    print("camera, disk: stars ms, grid ms, pairs ms (stars, pairs)")
+    print("| catalogue, field | stars, pairs | made: stars, grid, pairs ms | from disk ms |")
     for name, field, pixels, centroids in CAMERAS:
-        catalogue = Catalogue(tables[name])
+        catalogue, costs = Catalogue(tables[name]), []
         for disk in ("off", str(folder / "cache")):
             os.environ["EPIPOLE_CACHE"] = disk
             rows = [sky_cost(catalogue, field, pixels, centroids) for _ in range(repeats + 1)]
             stars, grid, pairs, *counts = np.median(rows[1:], axis=0)  # the first fills the disk
-            where = "made" if disk == "off" else "from disk"
-            print(f"{name} {field:g} deg, {where}: {stars:.0f}, {grid:.0f}, {pairs:.0f} {counts}")
+            costs.append(f"{stars:.0f}, {grid:.0f}, {pairs:.0f}")
+        sizes = ", ".join(f"{count:,.0f}" for count in counts)
+        print(f"| {name}, {field:g} degrees | {sizes} | {costs[0]} | {costs[1]} |")
 
 
 def sky_cost(catalogue: Catalogue, field: float, pixels: int, centroids: int) -> tuple[float, ...]:
