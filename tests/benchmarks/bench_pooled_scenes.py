@@ -28,9 +28,10 @@ from epipole.flows.evaluate import evaluate
 from epipole.flows.simulate import simulate
 from epipole.io.datasets.dataset import nights_in, read_table
 from epipole.io.simulation.truth import Truth, read_truth
-from epipole.schemas.bridge import array, stack, stack_covariance, to_polars
+from epipole.schemas.bridge import array, concat, stack, stack_covariance, to_polars
 from epipole.schemas.errors import SceneError
 from epipole.schemas.scene import validate_scene
+from epipole.schemas.tables import TABLES
 from epipole.tasks.algorithms.evaluation import squared_normalised_errors
 from epipole.tasks.evaluate.matching import (
     blended_objects,
@@ -118,9 +119,9 @@ def judge(dataset: Path, truth_folder: Path) -> dict[str, Any]:
     """Return squared errors of positions and states, and what is joined wrongly."""
     truth = read_truth(truth_folder)
     points = to_polars(truth.points)
-    (night,) = nights_in(str(dataset))
+    nights = nights_in(str(dataset))  # two, where the scene goes on after midnight
     detections, associations, positions, states = (
-        read_table(str(dataset), name, night)
+        concat(TABLES[name], [read_table(str(dataset), name, night) for night in nights])
         for name in ("detections", "associations", "positions", "states")
     )
     views = match_views(
