@@ -62,11 +62,10 @@ def judge(nights: Sequence[CalendarNight]) -> list[JudgedNight]:
     judged: list[JudgedNight] = []
     for k, night in enumerate(nights):
         before = [each.row for each in nights[max(k - USUAL_OF, 0) : k] if each.row]
-        reasons = _reasons(night.row, before)
-        if night.row and night.looks:
-            reasons = night.looks
-        by_counts = LOOK if reasons else WELL
-        verdict = (night.verdict or by_counts) if night.row else ""
+        recorded = night.looks if night.row else []
+        reasons = recorded or _reasons(night.row, before)
+        without_page = LOOK if reasons else WELL
+        verdict = (night.verdict or without_page) if night.row else ""
         judged.append(JudgedNight(night, verdict, reasons, not night.verdict))
     return judged
 

@@ -32,15 +32,9 @@ def test_a_run_writes_the_report_beside_its_nights(night_dataset, tmp_path):
     assert sorted(p.name for p in (tmp_path / "sub").iterdir()) == ["night.html"]
 
 
-def test_the_setting_changes_no_table_and_leaves_no_report_of_an_earlier_run(
-    night_dataset, night_log, tmp_path
-):
-    pages = tmp_path / "out" / "reports"
-    pages.mkdir(parents=True)
-    for night in (NIGHT, "2019-03-31"):
-        (pages / f"{night}.html").write_text("as it was before")
+def test_the_setting_changes_no_table(night_dataset, night_log, tmp_path):
     nightly([str(night_log)], str(tmp_path / "out"), settings=WITHOUT)
-    assert [page.name for page in pages.iterdir()] == ["2019-03-31.html"]
+    assert not (tmp_path / "out" / "reports").exists()
     night = f"night={NIGHT}"
     assert contents(tmp_path / "out" / night) == contents(night_dataset / night)
 
@@ -60,6 +54,12 @@ def test_a_report_that_fails_is_a_warning_and_the_night_is_published(
     assert warnings == [f"the report of {NIGHT} could not be made: no light"]
 
 
+def write_earlier_pages(dataset, nights):
+    (dataset / "reports").mkdir()
+    for night in nights:
+        (dataset / "reports" / f"{night}.html").write_text("the night as it was before")
+
+
 def test_without_drawing_every_night_is_looked_at(night_run, tmp_path, monkeypatch):
     def missing():
         raise ReportError("the report needs matplotlib")
@@ -70,7 +70,9 @@ def test_without_drawing_every_night_is_looked_at(night_run, tmp_path, monkeypat
         shutil.copytree(dataset / f"night={NIGHT}", tmp_path / f"night={night}")
     summary = dataclasses.replace(summary, dataset=str(tmp_path), nights=nights)
     monkeypatch.setattr(reports, "_drawing", missing)
+    write_earlier_pages(tmp_path, [*nights, "2019-03-31"])
     made = reports.with_reports(summary, dict.fromkeys(nights, tmp_path / "none"), write=True)
+    assert [page.name for page in (tmp_path / "reports").iterdir()] == ["2019-03-31.html"]
     assert sorted(made.looks) == nights
     assert made.extracts == ()
 
@@ -94,6 +96,7 @@ def test_a_report_that_fails_stops_no_other(night_run, tmp_path, monkeypatch):
 
     monkeypatch.setattr(reports, "night_facts", facts)
     monkeypatch.setattr(reports, "_page_and_extract", drawn)
+    write_earlier_pages(tmp_path, nights)
     summary = dataclasses.replace(summary, dataset=str(tmp_path), nights=nights)
     made = reports.with_reports(summary, dict.fromkeys(nights, tmp_path / "none"), write=True)
     assert sorted(made.looks) == nights[1:]
