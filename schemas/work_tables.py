@@ -275,6 +275,13 @@ VIEWS = schema(
         *axes("sensor_v{}_km_s", unit="km/s", frame="GCRF", null=True, doc="Velocity at the epoch"),
         column("position_sigma_km", F64, unit="km", doc="1-sigma per axis."),
         column("pixel_rad", F64, unit="rad", doc="Angle a pixel spans."),
+        column(
+            "magnitude",
+            F64,
+            unit="mag",
+            null=True,
+            doc="Mean of the detections that the direction was fitted to, without blended ones.",
+        ),
     ],
 )
 

@@ -23,6 +23,7 @@ from epipole.schemas.work_tables import VIEWS
 from epipole.tasks.algorithms.association.samples import Samples
 from epipole.tasks.algorithms.association.window_groups import Items
 from epipole.tasks.algorithms.geometry.directions import matrix_from_quaternion
+from epipole.tasks.algorithms.tracking.blends import BLEND_PX
 from epipole.tasks.common.grouping import group_offsets
 from epipole.tasks.common.sightings import camera_of, cameras_of
 
@@ -184,6 +185,7 @@ SAMPLED = [
         "position_sigma_km",
         "first_fitted",
         "last_fitted",
+        "magnitude",
     )
     or name.startswith(("w", "cov_"))
 ]
@@ -376,6 +378,7 @@ class SampledViews:
         self.noise = stack_covariance(views, "cov_noise_{}_rad2", TANGENT_AXES)
         self.bias = stack_covariance(views, "cov_bias_{}_rad2", TANGENT_AXES)
         self.sigma_km = array(views, "position_sigma_km")
+        self.magnitude = array(views, "magnitude")
         self.width_s = (array(views, "last_fitted") - array(views, "first_fitted")) / 1e9
 
     def samples(self, instants: Indices, skipped: Indices) -> tuple[Samples, Indices]:
@@ -423,7 +426,17 @@ class SampledViews:
             half_field=self.block.poses.half_field,
             rate=rate,
             sensor_km_s=poses.sensor_km_s,
+            magnitude=_means(self.magnitude[rows], item, t),
+            blend_rad=BLEND_PX / self.block.poses.focal_px,
         ), tracklet
+
+
+def _means(values: Array, group: Indices, n: int) -> Array:
+    """Return the mean of the known values of each of n groups, NaN without any."""
+    known = np.isfinite(values)
+    count = np.bincount(group[known], minlength=n)
+    total = np.bincount(group[known], values[known], n)
+    return np.divide(total, count, out=np.full(n, np.nan), where=count > 0)
 
 
 def _repeated(seen: Flags, time_s: Array, width_s: Array) -> Array:

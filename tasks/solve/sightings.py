@@ -362,7 +362,7 @@ def tabulate_sightings(sightings: SensorSightings | None) -> pa.Table:
     noise = _on_sky(u, _noise(sightings, u))
     sigma = np.sqrt(np.diagonal(noise, axis1=1, axis2=2))
     r_km, v_km_s = _states_at_rows(frames, tracklets)
-    magnitude, magnitude_sigma = _magnitudes(sightings)
+    magnitude, magnitude_sigma = magnitudes(sightings)
     columns = {
         "time": tracklets.time_ns,
         "sensor_id": array(frames.table, "sensor_id")[frame],
@@ -485,7 +485,7 @@ def _nearest(time_ns: Indices, bounds: Indices, number: Indices, at_ns: Indices)
 def _mean_magnitudes(sightings: SensorSightings, number: Indices) -> dict[str, Array]:
     """Return the mean magnitudes of tracklets, their errors and scatter; NaN where unknown."""
     tracklets = sightings.tracklets
-    magnitude, sigma = _magnitudes(sightings)
+    magnitude, sigma = magnitudes(sightings)
     known, n = np.isfinite(magnitude) & (sigma > 0), len(tracklets.name)
     weight = np.where(known, 1 / np.where(known, sigma, 1.0) ** 2, 0.0)
     value = np.where(known, magnitude, 0.0)
@@ -528,7 +528,8 @@ def _on_sky(u: Array, cov: Array) -> Array:
     return basis @ cov @ np.swapaxes(basis, 1, 2)
 
 
-def _magnitudes(sightings: SensorSightings) -> tuple[Array, Array]:
+def magnitudes(sightings: SensorSightings) -> tuple[Array, Array]:
+    """Return the magnitude of each sighting and its 1-sigma error; NaN where unknown."""
     frames, tracklets = sightings.frames, sightings.tracklets
     of_frames = (
         array(frames.table, name).astype(float)[tracklets.frame]

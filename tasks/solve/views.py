@@ -56,6 +56,7 @@ from epipole.tasks.solve.align_epochs import EpochGrid, align_epochs
 from epipole.tasks.solve.sightings import (
     SensorSightings,
     TrackletSightings,
+    magnitudes,
     optics_covariance,
     sight_objects,
     states_near_frames,
@@ -186,8 +187,8 @@ def _view_table(
         "pixel_rad": np.full(len(row), camera.pixel_rad),
     }
     columns = {key: values[kept] for key, values in columns.items()}
-    velocity = unstack("sensor_v{}_km_s", v_km_s[kept])
-    columns |= {name: nullable(values) for name, values in velocity.items()}
+    maybe = {"magnitude": _mean_magnitudes(sightings, fitted), **unstack("sensor_v{}_km_s", v_km_s)}
+    columns |= {name: nullable(values[kept]) for name, values in maybe.items()}
     columns["centroid"] = pa.array(centroid[kept], mask=missed[kept])
     return table(VIEWS, columns)
 
@@ -200,6 +201,16 @@ def _turn_noise(tracklets: TrackletSightings, fitted: Indices, cov_noise: Array)
     middle = (fitted[:, 0] + fitted[:, 1] - 1) // 2
     whole = np.trace(tracklets.cov_noise[middle], axis1=1, axis2=2)
     return tracklets.turn_rad2[middle] / whole * np.trace(cov_noise, axis1=1, axis2=2)
+
+
+def _mean_magnitudes(sightings: SensorSightings, fitted: Indices) -> Array:
+    """Return the mean magnitude of ranges of detections, (n, 2), without blended ones; else NaN."""
+    magnitude, _ = magnitudes(sightings)
+    known = np.isfinite(magnitude) & (sightings.tracklets.blend_rad2 == 0.0)
+    before = np.zeros((len(known) + 1, 2))
+    np.cumsum(np.stack([known, np.where(known, magnitude, 0.0)], axis=1), axis=0, out=before[1:])
+    count, total = (before[fitted[:, 1]] - before[fitted[:, 0]]).T
+    return np.divide(total, count, out=np.full(len(count), np.nan), where=count > 0)
 
 
 def _without_blends(

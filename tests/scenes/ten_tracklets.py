@@ -8,9 +8,16 @@ import itertools
 from typing import NamedTuple
 
 import numpy as np
+from scipy.stats import norm
 
 from epipole.tasks.algorithms.association.arcs import arc_odds
 from epipole.tasks.algorithms.association.chance import Chance
+from epipole.tasks.algorithms.association.odds import (
+    FLASH_SHARE,
+    MAG_PER_RAD,
+    OTHER_MAG,
+    SAME_MAG,
+)
 from epipole.tasks.algorithms.association.samples import InstantPoints, Samples
 from epipole.tasks.algorithms.association.search.field_index import cones_of, field_index
 from epipole.tasks.algorithms.association.search.search_space import (
@@ -58,11 +65,14 @@ def ten_tracklets(
     seen=1.0,
     sigma_km=0.05,
     shells=(),
+    magnitudes=False,
+    blend_rad=0.0,
 ):
     """Return a random scene: objects that all sensors see, and tracklets that one sensor sees.
 
     `moving`: directions have rates, and light takes its time. `seen`: share of the instants at
-    which a tracklet is seen. The errors of the directions differ along two axes.
+    which a tracklet is seen. `magnitudes`: most tracklets have one. `blend_rad`: see `Samples`.
+    The errors of the directions differ along two axes.
     """
     rng = np.random.default_rng(seed)
     times = np.asarray(times, float)
@@ -105,6 +115,8 @@ def ten_tracklets(
         half_field=np.full((n_sensors, 2), HALF_FIELD) * rng.uniform(0.5, 1.0, (n_sensors, 2)),
         rate=rate if moving else None,
         sensor_km_s=v if moving else None,
+        magnitude=_magnitudes(rng, who) if magnitudes else None,
+        blend_rad=np.full(n_sensors, blend_rad),
     )
     return scene_of(samples, np.array(who), rng, shells)
 
@@ -119,6 +131,7 @@ def scene_of(samples, who, rng, shells=()):
             for name in ("sensor", "start_s", "end_s", "seen", "u", "cov", "sigma_km")
         },
         rate=None if samples.rate is None else samples.rate[order],
+        magnitude=None if samples.magnitude is None else samples.magnitude[order],
     )
     views, again = views_of(samples)
     assert (again == np.arange(n)).all()
@@ -172,6 +185,14 @@ def _seen_from(path, r, v, times, moving):
         away = path(times - delay) - r
         delay = np.linalg.norm(away, axis=1) / SPEED_OF_LIGHT_KM_S
     return unit(away)
+
+
+def _magnitudes(rng, who):
+    """Return magnitudes (t,): objects differ, the sensors that see one little; some are unknown."""
+    who = np.array(who)
+    usual = np.append(rng.normal(9.0, 1.0, who.max() + 1), 9.0)[who]
+    out = usual + rng.normal(0.0, np.where(who < 0, 1.0, 0.3))
+    return np.where(rng.random(len(who)) < 0.2, np.nan, out)
 
 
 def _errors(rng, shape):
@@ -293,7 +314,8 @@ def range_km(samples, s, m, x):
 
 
 def expected_sensors(samples, members, points):
-    """Return the sensors that should detect the object: in their field, and bright enough.
+    """Return the sensors that should detect the object: in their field, bright enough, and apart
+    from other objects.
 
     A sensor without any tracklet at the points' instants is not counted (`odds.near_fields`).
     """
@@ -308,7 +330,17 @@ def expected_sensors(samples, members, points):
         if all(in_field(samples, s, m, at) for m, (at, _) in points.items())
         and range_km(samples, s, first, x) <= 1.5 * nearest
         and any(samples.seen[samples.sensor == s][:, list(points)].any(axis=0))
+        and not blends(samples, s, first, x)
     ]
+
+
+def blends(samples, s, m, x):
+    """Return whether a sensor sees another object so near the line to x that both are one dot."""
+    if samples.blend_rad is None:
+        return False
+    u = unit(x - samples.sensor_km[s, m])
+    there = np.flatnonzero((samples.sensor == s) & samples.seen[:, m])
+    return bool((np.arccos(samples.u[there, m] @ u) < samples.blend_rad[s]).any())
 
 
 def altitude_weight(shells, x):
@@ -330,6 +362,26 @@ def possible(samples, members, points):
             if samples.seen[i, m] and blocked(r, x, EARTH_RADIUS_KM - slack):
                 return False
     return True
+
+
+def magnitude_odds(samples, members, points):
+    """Return the log-odds by magnitudes: each sensor's, given that seen from the nearest side."""
+    total, before = 0.0, {}
+    for i in members:
+        there = [m for m in sorted(points) if samples.seen[i, m]]
+        s = int(samples.sensor[i])
+        if samples.magnitude is None or np.isnan(samples.magnitude[i]) or not there or s in before:
+            continue
+        line = points[there[0]][0] - samples.sensor_km[s, there[0]]
+        reduced = samples.magnitude[i] - 5 * np.log10(np.linalg.norm(line))
+        if before:
+            other, nearest = max(before.values(), key=lambda seen: seen[1] @ unit(line))
+            angle = np.arccos(np.clip(nearest @ unit(line), -1, 1))
+            sigma = min(np.hypot(SAME_MAG, MAG_PER_RAD * angle), OTHER_MAG)
+            same, unrelated = (norm.pdf(reduced - other, 0, size) for size in (sigma, OTHER_MAG))
+            total += np.log((FLASH_SHARE * unrelated + (1 - FLASH_SHARE) * same) / unrelated)
+        before[s] = reduced, unit(line)
+    return total
 
 
 def score(scene, members):
@@ -361,6 +413,7 @@ def score(scene, members):
         enter(scene.work._replace(points=arrays), samples, members, points)
         total = arc_odds(space.views, space.chance, np.array(members), arrays)[0]
     total += np.log(space.chance.objects_km3) + altitude_weight(space.shells, x)
+    total += magnitude_odds(samples, members, points)
     has = {int(samples.sensor[i]) for i in members}
     missed = [s for s in expected_sensors(samples, members, points) if s not in has]
     detected = space.chance.detected

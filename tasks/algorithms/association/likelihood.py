@@ -263,20 +263,19 @@ class _Search:
     def take(self, hypotheses: list[Hypothesis], min_log_odds: float) -> None:
         """Accept hypotheses, the likeliest first; members that a rival also has are ambiguous."""
         taken = self.space.taken
-        # Hypotheses that lost tracklets to a clear group are grown again from their seeds.
+        # Hypotheses that lost tracklets to a clear group are grown again from two others.
         intact, seeds = [], []
         for h in hypotheses:
             if taken[list(h.members)].any():
-                seeds.append(h.seed)
+                seeds += self._free_seed(h)
             else:
                 intact.append(h)
         regrown, _ = self.grow(np.array(seeds, np.int64).reshape(-1, 2))
         queue = HypothesisQueue(intact + regrown)
         while (best := queue.pop()) is not None and best.score >= min_log_odds:
             if taken[list(best.members)].any():
-                if not taken[list(best.seed)].any():
-                    for again in self.grow(np.array([best.seed]))[0]:
-                        queue.push(again)
+                for again in self.grow(np.array(self._free_seed(best), np.int64).reshape(-1, 2))[0]:
+                    queue.push(again)
                 continue
             if (
                 merged := best_merger(self.space, self.work, best, queue.sharing(best))
@@ -294,6 +293,15 @@ class _Search:
                 kept = set()
             self.ambiguous[sorted(set(best.members) - kept)] = True
             taken[list(best.members)] = True
+
+    def _free_seed(self, h: Hypothesis) -> list[tuple[int, int]]:
+        """Return two free members, of two sensors, from which a hypothesis can grow again: its seed
+        if that is free. Nothing if there are none."""
+        taken, sensor = self.space.taken, self.space.views.sensor
+        if not taken[list(h.seed)].any():
+            return [h.seed]
+        free = [i for i in h.members if not taken[i]]
+        return [(free[0], i) for i in free if sensor[i] != sensor[free[0]]][:1]
 
     def _withdraw_doubtful(self, min_log_odds: float) -> Array:
         """Withdraw groups that are too unlikely once the number of objects is known.

@@ -41,6 +41,10 @@ class Samples(NamedTuple):
     sensor_km_s : (s, k, 3) float or None
         Velocities of the sensors, GCRF; NaN where unknown. Without them, or without the rates,
         light time is ignored. This is right for sensors at similar ranges.
+    magnitude : (t,) float or None
+        Mean apparent magnitudes; NaN where unknown.
+    blend_rad : (s,) float or None
+        Angle between two objects below which a sensor sees them as one; None: always apart.
     """
 
     sensor: Indices
@@ -56,6 +60,8 @@ class Samples(NamedTuple):
     half_field: Array
     rate: Array | None = None
     sensor_km_s: Array | None = None
+    magnitude: Array | None = None
+    blend_rad: Array | None = None
 
     @property
     def field_sr(self) -> Array:

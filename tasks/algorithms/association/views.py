@@ -45,6 +45,10 @@ class Views(NamedTuple):
         Tracklets of a cell are ``cell_item[cell_start[q]:cell_start[q + 1]]``.
     bounded : (s,) bool
         No tracklet of the sensor is seen before its start or after its end.
+    magnitude : (t,) float
+        Mean apparent magnitudes; NaN where unknown.
+    blend_rad : (s,) float
+        Angle between two objects below which a sensor sees them as one.
     """
 
     first: Indices
@@ -59,6 +63,8 @@ class Views(NamedTuple):
     cell_start: Indices
     cell_item: Indices
     bounded: Flags
+    magnitude: Array
+    blend_rad: Array
 
     @property
     def position_km(self) -> Array:
@@ -110,6 +116,8 @@ def views_of(samples: Samples) -> tuple[Views, Indices]:
     cell_item = np.zeros(n_seen, np.int64)
     _fill_grids(first, seen, sight, camera, grid, cell_start, cell_item)
     camera[..., REACH] = _reach(camera, grid)
+    magnitude = np.full(len(order), np.nan) if samples.magnitude is None else samples.magnitude
+    blend_rad = np.zeros(n_sensors) if samples.blend_rad is None else samples.blend_rad
     views = Views(
         first=first,
         sensor=sensor,
@@ -123,6 +131,8 @@ def views_of(samples: Samples) -> tuple[Views, Indices]:
         cell_start=cell_start,
         cell_item=cell_item,
         bounded=_bounded(samples),
+        magnitude=magnitude[order].astype(float),
+        blend_rad=blend_rad.astype(float),
     )
     return views, order
 
@@ -334,6 +344,23 @@ def _fill_grids(first, seen, sight, camera, grid, cell_start, cell_item):
             cell_start[begin] = filled
             filled += n
             begin += side * side + 1
+
+
+@borrowing_kernel
+def cells_near(views, s, m, at0, at1, reach0, reach1):
+    """Return the grid cells near a point of a plane: first and last row, first and last column.
+
+    The plane is that of sensor s at instant m. Cells are near within `reach0` and `reach1` of the
+    coordinates `at0` and `at1`. Where the grid has no such cell, a last number is below the first.
+    """
+    cam, side = views.camera, views.grid[s, m, 1]
+    here = at0 - cam[s, m, CORNER]
+    lo0 = max(int(np.floor((here - reach0) * cam[s, m, SCALE])), 0)
+    hi0 = min(int(np.floor((here + reach0) * cam[s, m, SCALE])), side - 1)
+    here = at1 - cam[s, m, CORNER + 1]
+    lo1 = max(int(np.floor((here - reach1) * cam[s, m, SCALE + 1])), 0)
+    hi1 = min(int(np.floor((here + reach1) * cam[s, m, SCALE + 1])), side - 1)
+    return (lo0, hi0, lo1, hi1) if hi1 >= lo1 else (0, -1, 0, -1)
 
 
 @borrowing_kernel

@@ -6,6 +6,7 @@ import pytest
 from scenes.associations import START_NS, SceneTables, block_of, tables
 from scenes.tracklet_scenes import Scene
 
+from epipole.schemas.bridge import array
 from epipole.tasks.algorithms.association.samples import Samples
 from epipole.tasks.solve.association_input import SampledViews
 
@@ -111,3 +112,19 @@ def test_a_sensor_without_a_frame_near_an_instant_has_no_pose_there(scene):
     samples, _ = samples_of(of._replace(solutions=of.solutions.filter(near)), at(10.0, 100.0))
     known = np.isfinite(samples.R_sensor_from_icrs).all(axis=(2, 3))
     assert known.tolist() == [[True, False]] * 3
+
+
+def test_a_tracklet_s_magnitude_is_the_mean_of_those_of_its_views(scene):
+    of = tables(scene)
+    first = array(of.views, "tracklet_id") == of.views["tracklet_id"][0].as_py()
+    magnitude = np.where(first, np.arange(len(first)) / 10, np.nan)
+    seen_twice, unknown = (
+        samples_of(
+            with_columns(of, magnitude=pa.array(values, mask=np.isnan(values))), at(10.0, 40.0)
+        )
+        for values in (magnitude, np.full(len(first), np.nan))
+    )
+    rows = np.searchsorted(TIMES, [10.0, 40.0])
+    np.testing.assert_allclose(seen_twice[0].magnitude[0], magnitude[first][rows].mean())
+    assert np.isnan(seen_twice[0].magnitude[1:]).all()
+    assert np.isnan(unknown[0].magnitude).all()

@@ -27,6 +27,7 @@ CENTROID, STATED = 4.0, 35.0  # [arcsec]
 PIXEL = 1 / 3000  # [rad]
 CAMERA = Camera(1024, 1024, 1 / PIXEL, 1 / PIXEL, 511.5, 511.5)
 RATE = 40 * ARCSEC  # [rad/s]
+ZERO_MAG = 20.0
 APART_S = 13  # epochs so far apart share no detection
 
 
@@ -69,7 +70,8 @@ def views_of(seen, source, flux, cov_optics=None):
            for ab in ("xx", "xy", "xz", "yy", "yz", "zz")},
         "x_km": np.full(N_FRAMES, 7000.0), **{f"{a}_km": np.zeros(N_FRAMES) for a in "yz"},
         **{f"v{a}_km_s": np.zeros(N_FRAMES) for a in "xyz"},
-        "used_position_sigma_km": np.full(N_FRAMES, 0.02),
+        "used_position_sigma_km": np.full(N_FRAMES, 0.02), "zero_mag": np.full(N_FRAMES, ZERO_MAG),
+        **{f"{a}_mag2": np.zeros(N_FRAMES) for a in ("zero_variance", "flux_floor", "flux_photon")},
     })  # fmt: skip
     detections = filled(DETECTIONS, len(frame), {
         "sensor_id": ["s"] * len(frame), "frame_number": frame, "time": time[frame],
@@ -181,3 +183,15 @@ def test_what_the_attitude_does_not_compensate_of_the_optics_is_a_bias(
         ]  # fmt: skip
         added_px = np.sqrt(np.trace(bias[1] - bias[0], axis1=1, axis2=2)) / PIXEL
         np.testing.assert_allclose(added_px, expected_px, atol=0.15)
+
+
+def test_a_view_has_the_mean_magnitude_of_its_detections_without_blended_ones():
+    views, _, one = views_of_a_blend(0)
+    magnitude = views["magnitude"].to_numpy(zero_copy_only=False)
+    alone = array(views, "blend_rad2") == 0
+    np.testing.assert_allclose(magnitude[alone], ZERO_MAG - 2.5 * np.log10(40.0))
+    middle = np.abs(np.arange(N_FRAMES) - 30) < 5
+    assert np.isnan(magnitude[middle & one]).all()  # a minute of blends has none that is not
+    still = {"frame": np.arange(N_FRAMES), "item": np.zeros(N_FRAMES, int),
+             "u": np.tile([1.0, 0.0, 0.0], (N_FRAMES, 1))}  # fmt: skip
+    assert views_of(still, "stars", np.full(N_FRAMES, np.nan))["magnitude"].null_count == N_FRAMES

@@ -3,7 +3,7 @@
 `best_of_sensor` is the inner loop of the search:
 
 1. The points are projected onto the sensor's plane, with their covariance (`_predict`).
-2. Only grid cells within the gate are searched (`_gate`, `_window`).
+2. Only grid cells within the gate are searched (`_gate`, `cells_near`).
 3. Each free tracklet there is weighed: what it adds to the log-odds (`_fit`).
 4. Tracklets that overlap in time with a member of the same sensor are skipped.
 """
@@ -12,14 +12,12 @@ import numpy as np
 
 from epipole.tasks.algorithms.association.search.sight_lines import quantile
 from epipole.tasks.algorithms.association.views import (
-    CORNER,
     DX,
     DY,
     HAS_RATE,
     MAX_RATE,
     MAX_VARIANCE,
     PLANE,
-    SCALE,
     SIGMA_KM,
     V_KM_S,
     XX,
@@ -27,6 +25,7 @@ from epipole.tasks.algorithms.association.views import (
     YY,
     X,
     Y,
+    cells_near,
     extra_light_s,
 )
 from epipole.tasks.algorithms.kernels import borrowing_kernel, inlined_kernel
@@ -66,7 +65,9 @@ def best_of_sensor(space, work, s, same_sensor, min_gain):
         if seen_by[m] < 2 or views.grid[s, m, 1] == 0 or not predicted[m, DEPTH] > 0.0:
             continue
         reach0, reach1 = _gate(views, s, m, predicted, gate_sigma)
-        lo0, hi0, lo1, hi1 = _window(views, s, m, predicted, reach0, reach1)
+        lo0, hi0, lo1, hi1 = cells_near(
+            views, s, m, predicted[m, A0], predicted[m, A1], reach0, reach1
+        )
         for g0 in range(lo0, hi0 + 1):
             row = views.grid[s, m, 0] + g0 * views.grid[s, m, 1]
             for k in range(views.cell_start[row + lo1], views.cell_start[row + hi1 + 1]):
@@ -137,23 +138,6 @@ def _gate(views, s, m, predicted, gate_sigma):
     reach0 = gate * np.sqrt(predicted[m, H00] + errors) + abs(predicted[m, MOTION0]) + drift
     reach1 = gate * np.sqrt(predicted[m, H11] + errors) + abs(predicted[m, MOTION1]) + drift
     return reach0, reach1
-
-
-@borrowing_kernel
-def _window(views, s, m, predicted, reach0, reach1):
-    """Return the grid cells within the gate: first and last row, first and last column.
-
-    `predicted` (k, 10) is of `_predict`; `reach0` and `reach1`, on the plane, are of `_gate`. Where
-    the grid has no such cell, a last number is below the first.
-    """
-    cam, side = views.camera, views.grid[s, m, 1]
-    here = predicted[m, A0] - cam[s, m, CORNER]
-    lo0 = max(int(np.floor((here - reach0) * cam[s, m, SCALE])), 0)
-    hi0 = min(int(np.floor((here + reach0) * cam[s, m, SCALE])), side - 1)
-    here = predicted[m, A1] - cam[s, m, CORNER + 1]
-    lo1 = max(int(np.floor((here - reach1) * cam[s, m, SCALE + 1])), 0)
-    hi1 = min(int(np.floor((here + reach1) * cam[s, m, SCALE + 1])), side - 1)
-    return (lo0, hi0, lo1, hi1) if hi1 >= lo1 else (0, -1, 0, -1)
 
 
 @borrowing_kernel
@@ -249,7 +233,9 @@ def other_group_near(space, work, s, group, g):
         if seen_by[m] < 2 or views.grid[s, m, 1] == 0 or not predicted[m, DEPTH] > 0.0:
             continue
         reach0, reach1 = _gate(views, s, m, predicted, space.gate_sigma)
-        lo0, hi0, lo1, hi1 = _window(views, s, m, predicted, reach0, reach1)
+        lo0, hi0, lo1, hi1 = cells_near(
+            views, s, m, predicted[m, A0], predicted[m, A1], reach0, reach1
+        )
         for g0 in range(lo0, hi0 + 1):
             row = views.grid[s, m, 0] + g0 * views.grid[s, m, 1]
             for k in range(views.cell_start[row + lo1], views.cell_start[row + hi1 + 1]):

@@ -7,6 +7,7 @@ from scenes.passages import passages
 from scenes.tracklet_scenes import GEO, V_GEO, Scene, judge, pairs, solve
 
 from epipole.tasks.algorithms.association.samples import Samples
+from epipole.tasks.algorithms.constants import ARCSEC
 
 
 @pytest.mark.parametrize("n_sensors", [3, 4, 8])
@@ -31,9 +32,9 @@ def test_two_sensors_at_one_instant_in_dense_clutter_report_few_wrong_groups():
     assert len(wrong) <= 2
 
 
-def test_two_objects_that_two_sensors_cannot_tell_apart_are_ambiguous():
+def two_in_one_epipolar_plane():
+    """Two objects that both sensors see, each of whose four pairings meets at a point."""
     scene = Scene(3, 2, times=np.array([0.0]))
-    # Both in one epipolar plane of both sensors: each of the four pairings meets at a point.
     baseline = scene.r[1, 0] - scene.r[0, 0]
     towards = (GEO - scene.r[0, 0]) / np.linalg.norm(GEO - scene.r[0, 0])
     across = baseline - (baseline @ towards) * towards
@@ -42,9 +43,53 @@ def test_two_objects_that_two_sensors_cannot_tell_apart_are_ambiguous():
         for s in range(2):
             path = GEO + off * across + scene.times[:, None] * V_GEO - scene.r[s]
             scene.add(s, k, path / np.linalg.norm(path, axis=1, keepdims=True))
-    groups = solve(scene.samples())
+    return scene
+
+
+@pytest.mark.parametrize("magnitude", [None, [9.0, 9.1, 9.1, 9.0], [np.nan] * 4])
+def test_two_objects_that_two_sensors_cannot_tell_apart_are_ambiguous(magnitude):
+    samples = two_in_one_epipolar_plane().samples()
+    magnitude = None if magnitude is None else np.array(magnitude)
+    groups = solve(samples._replace(magnitude=magnitude))
     assert groups.ambiguous.all()
     assert (groups.group == -1).all()
+
+
+@pytest.mark.parametrize("seen_as", [[7.0, 7.1, 9.1, 9.0], [9.1, 9.0, 7.0, 7.1]])
+def test_magnitudes_tell_two_objects_apart_that_directions_do_not(seen_as):
+    """The sensors are 11 degrees apart as seen from there, and agree to 0.1 mag."""
+    scene = two_in_one_epipolar_plane()
+    groups = solve(scene.samples()._replace(magnitude=np.array(seen_as)))
+    assert pairs(groups.group) == pairs(np.array(scene.who))
+
+
+def test_a_magnitude_of_a_sensor_whose_position_is_unknown_at_times_does_no_harm():
+    times = np.arange(5.0, 120.0, 12.0)
+    scene = Scene(0, 3, times=times).objects(1)
+    scene.seen[2] = times > 60
+    samples = scene.samples()
+    sensor_km = samples.sensor_km.copy()
+    sensor_km[2, :3] = np.nan
+    known = samples._replace(sensor_km=sensor_km, magnitude=np.array([9.0, 9.1, 9.0]))
+    assert solve(known).group.tolist() == [0, 0, 0]
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_a_sensor_that_blends_two_objects_misses_neither(seed):
+    """Two sensors see both apart; four others see one dot at the light of the brighter one."""
+    scene = Scene(seed, 6).objects(2, spread_km=3.0)
+    for i in reversed(range(len(scene.who))):
+        if scene.sensor[i] >= 2 and scene.who[i] == 1:
+            for rows in (scene.sensor, scene.who, scene.seen, scene.u):
+                del rows[i]
+    samples = scene.samples()
+    seen_as_one = samples._replace(blend_rad=np.full(6, 60 * ARCSEC))
+    second = np.flatnonzero(np.array(scene.who) == 1)
+    assert (solve(samples).group[second] == -1).all()
+    groups = solve(seen_as_one)
+    assert len(set(groups.group[second])) == 1
+    assert groups.group[second[0]] >= 0
+    assert groups.group[second[0]] not in groups.group[np.array(scene.who) == 0]
 
 
 def test_tracklets_that_fit_one_object_with_too_little_evidence_are_undecided():

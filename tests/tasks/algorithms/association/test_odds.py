@@ -35,6 +35,8 @@ SCENES = [
     {"moving": True, "shells": SHELLS},
     {"times": (0.0, 12.0, 30.0), "seen": 0.7, "shells": SHELLS},
     {"times": (0.0, 15.0), "moving": True},
+    {"magnitudes": True},
+    {"magnitudes": True, "times": (0.0, 12.0, 30.0), "seen": 0.7, "blend_rad": np.radians(0.1)},
 ]
 
 
