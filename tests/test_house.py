@@ -80,6 +80,17 @@ def test_functions_are_short():
     assert long == []
 
 
+def test_kernels_say_what_they_take():
+    """Their arguments have no types: the docstring is all that a reader has."""
+    silent = [
+        f"{path}: {node.name}"
+        for path, node in functions()
+        if any(ast.unparse(by).endswith("kernel") for by in node.decorator_list)
+        and not ast.get_docstring(node)
+    ]
+    assert silent == []
+
+
 def test_functions_have_few_parameters():
     many = [
         f"{path}: {node.name}"

@@ -289,6 +289,7 @@ def _along(a: Array, b: Array) -> Array:
 
 @borrowing_kernel
 def _dot_at(a, m, b, n):
+    """Return the product of the vectors (3,) that begin at ``a[m]`` and ``b[n]``."""
     return a[m] * b[n] + a[m + 1] * b[n + 1] + a[m + 2] * b[n + 2]
 
 

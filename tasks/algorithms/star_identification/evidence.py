@@ -210,6 +210,7 @@ def _brightness(star_of, instrumental, magnitude, log_density, zero, scatter):
 
 @borrowing_kernel
 def _log_determinant(P):
+    """Return the log of the determinant of a covariance P (3, 3); of 1e-300 if that is smaller."""
     return math.log(max(determinant3(P), 1e-300))
 
 

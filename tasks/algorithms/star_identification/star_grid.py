@@ -156,11 +156,13 @@ class ConeCells(NamedTuple):
 
 @borrowing_kernel
 def _band(z):
+    """Return the band, 0 to BANDS - 1, of a unit vector's z."""
     return min(max(int((z + 1.0) * 0.5 * BANDS), 0), BANDS - 1)
 
 
 @borrowing_kernel
 def _sector(azimuth):
+    """Return the sector of an azimuth [rad]; beyond a turn the numbers go on, see `cell_at`."""
     return math.floor(azimuth * (SECTORS / (2.0 * math.pi)))
 
 
@@ -177,7 +179,7 @@ def by_bands(u):
 
 @borrowing_kernel
 def cell_at(band, sector):
-    """Return the cell of a band and a sector (compiled)."""
+    """Return the cell of a band and a sector, of any turn (compiled)."""
     return band * SECTORS + (sector & (SECTORS - 1))
 
 

@@ -97,6 +97,13 @@ def range_of(index, low, high):
 # The pairs.
 
 
+@borrowing_kernel
+def chord(a, i, b, j):
+    """Return the chord between row i of the unit vectors a (n, 3) and row j of b (m, 3)."""
+    dx, dy, dz = a[i, 0] - b[j, 0], a[i, 1] - b[j, 1], a[i, 2] - b[j, 2]
+    return np.sqrt(dx * dx + dy * dy + dz * dz)
+
+
 class NearStars(NamedTuple):
     """The near neighbours of each star, star by star.
 

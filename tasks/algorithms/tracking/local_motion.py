@@ -238,6 +238,10 @@ def _enter_errors(q, lo, value, unmodelled, detections, fits):
 
 @kernel
 def _evaluate(queries, detections, fits):
+    """Write to `fits` the direction and rate of a tracklet at each time of `queries`.
+
+    `detections` are those of all tracklets; each query names the rows of its own.
+    """
     t, u = detections.t, detections.u
     for q in range(len(queries.at)):
         first, last, at = queries.first[q], queries.last[q], queries.at[q]

@@ -265,6 +265,7 @@ def _set_axes(directions, lo, hi, axes):
 
 @kernel
 def _along(u, axis):
+    """Return the component of u (3,) along an axis (3,)."""
     return u[0] * axis[0] + u[1] * axis[1] + u[2] * axis[2]
 
 

@@ -27,7 +27,7 @@ from epipole.tasks.algorithms.star_identification.sensor import IdentifiedSensor
 from epipole.tasks.algorithms.star_identification.sensor_model import Skies
 from epipole.tasks.algorithms.star_identification.sequence import Priors
 from epipole.tasks.algorithms.star_identification.star_grid import Sky, pattern_pairs
-from epipole.tasks.algorithms.star_identification.star_pairs import PairTable, range_of
+from epipole.tasks.algorithms.star_identification.star_pairs import PairTable, chord, range_of
 
 N_BASE = 8  # brightest centroids of which four are tried at a time
 PAIR_GATE = 3.0  # sigma; of a separation
@@ -82,13 +82,8 @@ def make_matcher(sky: Sky, optics: FieldOfView) -> Matcher:
 
 
 @kernel
-def _chord(a, i, b, j):
-    dx, dy, dz = a[i, 0] - b[j, 0], a[i, 1] - b[j, 1], a[i, 2] - b[j, 2]
-    return math.sqrt(dx * dx + dy * dy + dz * dz)
-
-
-@kernel
 def _tolerance(sigma, i, j, c):
+    """Return the tolerance of the chord c between centroids i and j; `sigma` (n,) [rad]."""
     # Aberration stretches by v / c at most.
     return PAIR_GATE * math.sqrt(sigma[i] * sigma[i] + sigma[j] * sigma[j]) + 1.1e-4 * c
 
@@ -156,12 +151,12 @@ def _identities(u, sigma, p, star_u, pairs, counter, out):
     """
     low, high = np.zeros(4, np.int64), np.zeros(4, np.int64)
     for k in range(1, 4):
-        c = _chord(u, p[0], u, p[k])
+        c = chord(u, p[0], u, p[k])
         t = _tolerance(sigma, p[0], p[k], c)
         low[k], high[k] = range_of(pairs.chord, c - t, c + t)
     first, neighbour, bound = _common_neighbours(pairs, low, high, counter)
     count = 0
-    c23, c24, c34 = _chord(u, p[1], u, p[2]), _chord(u, p[1], u, p[3]), _chord(u, p[2], u, p[3])
+    c23, c24, c34 = chord(u, p[1], u, p[2]), chord(u, p[1], u, p[3]), chord(u, p[2], u, p[3])
     t23, t24, t34 = (
         _tolerance(sigma, p[1], p[2], c23),
         _tolerance(sigma, p[1], p[3], c24),
@@ -174,13 +169,13 @@ def _identities(u, sigma, p, star_u, pairs, counter, out):
         s1, s2 = first[i], neighbour[i]
         for j in range(np.searchsorted(first3, s1), np.searchsorted(first3, s1 + 1)):
             s3 = neighbour[three[j]]
-            if s3 == s2 or abs(_chord(star_u, s2, star_u, s3) - c23) > t23:
+            if s3 == s2 or abs(chord(star_u, s2, star_u, s3) - c23) > t23:
                 continue
             for k in range(np.searchsorted(first4, s1), np.searchsorted(first4, s1 + 1)):
                 s4 = neighbour[four[k]]
-                if s4 in (s2, s3) or abs(_chord(star_u, s2, star_u, s4) - c24) > t24:
+                if s4 in (s2, s3) or abs(chord(star_u, s2, star_u, s4) - c24) > t24:
                     continue
-                if abs(_chord(star_u, s3, star_u, s4) - c34) > t34:
+                if abs(chord(star_u, s3, star_u, s4) - c34) > t34:
                     continue
                 if count == len(out):
                     return 0
@@ -202,13 +197,13 @@ def _match_rest(u, sigma, p, star_u, s, star):
     diagonal = 0.0
     for k in range(len(u)):
         for b in range(4):
-            diagonal = max(diagonal, _chord(u, k, u, p[b]))
+            diagonal = max(diagonal, chord(u, k, u, p[b]))
     measured, listed = np.empty((4, 4)), np.empty((4, 4))
     for b in range(4):
         star[p[b]] = s[b]
         for c in range(4):
-            measured[b, c] = _chord(u, p[b], u, p[c])
-            listed[b, c] = _chord(star_u, s[b], star_u, s[c])
+            measured[b, c] = chord(u, p[b], u, p[c])
+            listed[b, c] = chord(star_u, s[b], star_u, s[c])
     r, big_r = np.empty(4), np.empty(4)
     best_of = np.full(len(u), 1e9)
     matches = 0
@@ -217,7 +212,7 @@ def _match_rest(u, sigma, p, star_u, s, star):
             continue
         inside = True
         for b in range(4):
-            big_r[b] = _chord(star_u, t, star_u, s[b])
+            big_r[b] = chord(star_u, t, star_u, s[b])
             inside = big_r[b] < 1.01 * diagonal
             if not inside:
                 break
@@ -229,7 +224,7 @@ def _match_rest(u, sigma, p, star_u, s, star):
             worst = 0.0
             limit = DISSIMILARITY_SIGMA2 * sigma[k] * sigma[k]
             for b in range(4):
-                r[b] = _chord(u, k, u, p[b])
+                r[b] = chord(u, k, u, p[b])
                 worst = max(worst, (r[b] - big_r[b]) ** 2)
             if worst > limit:
                 continue
@@ -255,6 +250,11 @@ def _match_rest(u, sigma, p, star_u, s, star):
 
 @kernel
 def _match(u, sigma, star_u, pairs, star):
+    """Write the star of each centroid to `star` (n,), -1 before and where the four disagree.
+
+    The centroids are directions u (n, 3), sensor frame, the brightest first, with errors `sigma`
+    (n,) [rad]; the stars are star_u (m, 3), ICRS, and their `pairs` a `PairTable`.
+    """
     n = len(u)
     m = min(n, N_BASE)
     counter = np.zeros(len(star_u), np.int8)

@@ -28,7 +28,7 @@ from epipole.tasks.algorithms.star_identification.sensor import IdentifiedSensor
 from epipole.tasks.algorithms.star_identification.sensor_model import Skies
 from epipole.tasks.algorithms.star_identification.sequence import Priors
 from epipole.tasks.algorithms.star_identification.star_grid import Sky, pattern_pairs
-from epipole.tasks.algorithms.star_identification.star_pairs import PairTable, range_of
+from epipole.tasks.algorithms.star_identification.star_pairs import PairTable, chord, range_of
 
 BIN_RAD = math.radians(0.01)
 PAIR_GATE = 2.5  # sigma; of a separation
@@ -77,19 +77,13 @@ def make_matcher(sky: Sky, optics: FieldOfView) -> Matcher:
 
 
 @kernel
-def _chord(a, i, b, j):
-    dx, dy, dz = a[i, 0] - b[j, 0], a[i, 1] - b[j, 1], a[i, 2] - b[j, 2]
-    return math.sqrt(dx * dx + dy * dy + dz * dz)
-
-
-@kernel
 def _bins(u, sigma, i, j):
     """Return the chords between which the bins lie that a separation's error reaches.
 
     The separation is between rows i and j of the centroids u (n, 3), with errors `sigma` (n,)
     [rad].
     """
-    angle = 2.0 * math.asin(min(0.5 * _chord(u, i, u, j), 1.0))
+    angle = 2.0 * math.asin(min(0.5 * chord(u, i, u, j), 1.0))
     reach = PAIR_GATE * math.sqrt(sigma[i] * sigma[i] + sigma[j] * sigma[j]) + 1.1e-4 * angle
     low = math.floor((angle - reach) / BIN_RAD) * BIN_RAD
     high = math.ceil((angle + reach) / BIN_RAD) * BIN_RAD
@@ -123,7 +117,7 @@ def _triangles(u, sigma, star_u, pairs, neighbours_in_order, s, set_low, set_hig
             closed = False
             for a in before:
                 for b in neighbours[:n]:
-                    closed = closed or (a != b and low <= _chord(star_u, a, star_u, b) <= high)
+                    closed = closed or (a != b and low <= chord(star_u, a, star_u, b) <= high)
             total += closed
         before = neighbours[:n]
     return total
@@ -131,6 +125,11 @@ def _triangles(u, sigma, star_u, pairs, neighbours_in_order, s, set_low, set_hig
 
 @kernel
 def _match(u, sigma, star_u, pairs, star):
+    """Write the star of each centroid to `star` (n,), which is -1 before.
+
+    The centroids are directions u (n, 3), sensor frame, with errors `sigma` (n,) [rad]; the stars
+    are star_u (m, 3), ICRS, and their `pairs` a `PairTable`.
+    """
     n, m = len(u), len(star_u)
     state, counted_in = np.zeros(m, np.int16), np.zeros(m, np.int32)
     separation = np.empty(n)
@@ -139,7 +138,7 @@ def _match(u, sigma, star_u, pairs, star):
     for main in range(n):
         state[:] = 0
         for k in range(n):
-            separation[k] = _chord(u, main, u, k) if k != main else 1e9
+            separation[k] = chord(u, main, u, k) if k != main else 1e9
         order = np.argsort(separation)
         used = min(n - 1, N_NEIGHBOURS)
         for k in range(used):

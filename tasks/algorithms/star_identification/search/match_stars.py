@@ -210,6 +210,12 @@ def match_stars(u, sigma, v, radius, matches, strict, owner, contested):
 
 @borrowing_kernel
 def _drop_odd(star_of, instrumental, magnitude, zero_point):
+    """Take the star from centroids whose magnitude differs from it by more than `MAX_MAG_ERROR`.
+
+    `star_of` (n,) is changed to -1 there. `instrumental` (n,) are magnitudes of the centroids, NaN
+    where unknown, `magnitude` (m,) those of the stars, and `zero_point` what is between them; with
+    NaN nothing changes.
+    """
     if math.isnan(zero_point):
         return
     for k in range(len(star_of)):

@@ -56,6 +56,10 @@ class Pair(NamedTuple):
 
 @borrowing_kernel
 def _cell(v, corner, per_cell):
+    """Return the column or row of a coordinate v: 0 to CELLS - 1, the nearest for one outside.
+
+    `corner` is the coordinate at which cell 0 begins, `per_cell` the number of cells per unit.
+    """
     return int(min(max((v - corner) * per_cell, 0.0), CELLS - 1.0))
 
 

@@ -270,6 +270,7 @@ def gather_votes(problem, i, n_companions, log2, votes, min_votes, refined):
 
 @borrowing_kernel
 def _bin_of(star, turn):
+    """Return the bin, 0 to 2^14 - 1, of a star and a part of a turn: a hash."""
     return (star * 40_503 + turn * 10_007) & ((1 << _BINS_LOG2) - 1)
 
 
