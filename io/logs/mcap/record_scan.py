@@ -119,7 +119,10 @@ def _columns(n: int) -> list[npt.NDArray[Any]]:
 
 @kernel
 def _ends_run(data, kind, after):
-    """Return whether a record outside chunks ends a run of records."""
+    """Return whether a record outside chunks ends a run of records.
+
+    `kind` is its opcode, `after` the offset behind it in `data`, which are bytes.
+    """
     if kind == DATA_END and after < len(data):
         # Where no summary follows, it ends nothing.
         return data[after] >= PRIVATE or data[after] == FOOTER or data[after] in OF_SUMMARY
@@ -128,7 +131,26 @@ def _ends_run(data, kind, after):
 
 @kernel
 def _walk(data, at, outside, ends, most, opcode, channel, time_ns, start, end):
-    """Return how many records there are, and write those that the columns have room for."""
+    """Return how many records there are, and write those that the columns have room for.
+
+    Parameters
+    ----------
+    data, at
+        Bytes, and the offset of the first record.
+    outside, ends
+        The records are a run outside chunks; the walk ends where that run does.
+    most
+        The walk ends before record number `most` + 1.
+    opcode, channel, time_ns, start, end : (n,)
+        The columns: those of `RecordIndex`.
+
+    Returns
+    -------
+    int, int
+        How many there are, and the offset behind the last.
+    int, int
+        The number of strange records, which have no row, and the offset of the first.
+    """
     n, n_strange, first_strange, size, room = 0, 0, np.int64(0), len(data), len(opcode)
     at = np.int64(at)
     while at + HEAD_BYTES <= size:
@@ -180,6 +202,11 @@ def index_counts(data: Bytes, limit: int) -> tuple[npt.NDArray[Any], npt.NDArray
 
 @kernel
 def _walk_indexes(data, limit, number, counted):
+    """Write channel and number of messages of each message index; see `index_counts`.
+
+    `number` and `counted` (n,) have room for all in `data`. Returns how many were written, and
+    where they end.
+    """
     n, at = 0, np.int64(0)
     while at + HEAD_BYTES + INDEX_BYTES <= len(data) and data[at] == MESSAGE_INDEX:
         length = load_uint64(data, at + 1)
@@ -211,6 +238,11 @@ def no_declarations() -> Hashes:
 
 @kernel
 def _changed(data, opcode, start, end, last):
+    """Return which records are no repetition, (n,) bool; see `changed_declarations`.
+
+    The columns (n,) are of `RecordIndex`; `last` (2, 65536), of schemas and of channels, is brought
+    up to date.
+    """
     changed = np.ones(len(opcode), np.bool_)
     for i in range(len(opcode)):
         if opcode[i] == MESSAGE:

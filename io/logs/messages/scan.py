@@ -119,6 +119,7 @@ def _valid_id(data, at, n):
 
 @kernel
 def _same(data, at, n, names, code):
+    """Return whether the n bytes of `data` from `at` on are the name of this code in `names`."""
     if names.length[code] != n:
         return False
     for k in range(n):  # noqa: SIM110 (numba has no generator expressions)
@@ -129,7 +130,7 @@ def _same(data, at, n, names, code):
 
 @kernel
 def _find(data, at, n, names):
-    """Return the code of a name, or -1."""
+    """Return the code of a name, the n bytes of `data` from `at` on, or -1."""
     for code in range(names.n[0]):
         if _same(data, at, n, names, code):
             return code

@@ -240,7 +240,7 @@ def _enter_errors(q, lo, value, unmodelled, detections, fits):
 def _evaluate(queries, detections, fits):
     """Write to `fits` the direction and rate of a tracklet at each time of `queries`.
 
-    `detections` are those of all tracklets; each query names the rows of its own.
+    `detections` are those of all tracklets; each query names the rows of one.
     """
     t, u = detections.t, detections.u
     for q in range(len(queries.at)):
