@@ -63,6 +63,16 @@ def test_magnitudes_tell_two_objects_apart_that_directions_do_not(seen_as):
     assert pairs(groups.group) == pairs(np.array(scene.who))
 
 
+@pytest.mark.parametrize("scatter", [1.5, 30.0])
+@pytest.mark.parametrize("n_sensors", [3, 8])
+def test_magnitudes_that_mean_nothing_lose_no_object(n_sensors, scatter):
+    scene = Scene(n_sensors, n_sensors).objects(20).strays(20)
+    random = np.random.default_rng(1).normal(8.0, scatter, len(scene.who))
+    precision, recall = judge(scene, solve(scene.samples()._replace(magnitude=random)))
+    assert precision > 0.995
+    assert recall > 0.97
+
+
 def test_a_magnitude_of_a_sensor_whose_position_is_unknown_at_times_does_no_harm():
     times = np.arange(5.0, 120.0, 12.0)
     scene = Scene(0, 3, times=times).objects(1)
