@@ -187,7 +187,10 @@ def _view_table(
         "pixel_rad": np.full(len(row), camera.pixel_rad),
     }
     columns = {key: values[kept] for key, values in columns.items()}
-    maybe = {"magnitude": _mean_magnitudes(sightings, fitted), **unstack("sensor_v{}_km_s", v_km_s)}
+    maybe = {
+        "magnitude": _fitted_magnitudes(sightings, fitted),
+        **unstack("sensor_v{}_km_s", v_km_s),
+    }
     columns |= {name: nullable(values[kept]) for name, values in maybe.items()}
     columns["centroid"] = pa.array(centroid[kept], mask=missed[kept])
     return table(VIEWS, columns)
@@ -203,7 +206,7 @@ def _turn_noise(tracklets: TrackletSightings, fitted: Indices, cov_noise: Array)
     return tracklets.turn_rad2[middle] / whole * np.trace(cov_noise, axis1=1, axis2=2)
 
 
-def _mean_magnitudes(sightings: SensorSightings, fitted: Indices) -> Array:
+def _fitted_magnitudes(sightings: SensorSightings, fitted: Indices) -> Array:
     """Return the mean magnitude of ranges of detections, (n, 2), without blended ones; else NaN."""
     magnitude, _ = magnitudes(sightings)
     known = np.isfinite(magnitude) & (sightings.tracklets.blend_rad2 == 0.0)

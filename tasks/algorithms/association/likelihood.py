@@ -263,18 +263,13 @@ class _Search:
     def take(self, hypotheses: list[Hypothesis], min_log_odds: float) -> None:
         """Accept hypotheses, the likeliest first; members that a rival also has are ambiguous."""
         taken = self.space.taken
-        # Hypotheses that lost tracklets to a clear group are grown again from two others.
-        intact, seeds = [], []
+        intact, broken = [], []  # some may have lost tracklets to a clear group
         for h in hypotheses:
-            if taken[list(h.members)].any():
-                seeds += self._free_seed(h)
-            else:
-                intact.append(h)
-        regrown, _ = self.grow(np.array(seeds, np.int64).reshape(-1, 2))
-        queue = HypothesisQueue(intact + regrown)
+            (broken if taken[list(h.members)].any() else intact).append(h)
+        queue = HypothesisQueue(intact + self._grow_again(broken))
         while (best := queue.pop()) is not None and best.score >= min_log_odds:
             if taken[list(best.members)].any():
-                for again in self.grow(np.array(self._free_seed(best), np.int64).reshape(-1, 2))[0]:
+                for again in self._grow_again([best]):
                     queue.push(again)
                 continue
             if (
@@ -293,6 +288,11 @@ class _Search:
                 kept = set()
             self.ambiguous[sorted(set(best.members) - kept)] = True
             taken[list(best.members)] = True
+
+    def _grow_again(self, hypotheses: Iterable[Hypothesis]) -> list[Hypothesis]:
+        """Return what grows from the free members of hypotheses that have lost others."""
+        seeds = [seed for h in hypotheses for seed in self._free_seed(h)]
+        return self.grow(np.array(seeds, np.int64).reshape(-1, 2))[0]
 
     def _free_seed(self, h: Hypothesis) -> list[tuple[int, int]]:
         """Return two free members, of two sensors, from which a hypothesis can grow again: its seed

@@ -124,9 +124,8 @@ def looks_at(views, s, X, seen_by):
 def should_detect(views, s, points, nearest_km2):
     """Return whether a sensor without a tracklet of the object counts as a miss.
 
-    It does if the points, `InstantPoints`, are in its field, and not much fainter than for the
-    members' sensors: `nearest_km2` is `nearest_range2` of these. Nor does a sensor miss the object
-    that sees another one in the same spot.
+    It does if the points, `InstantPoints`, are in its field, not much fainter than for the members'
+    sensors (`nearest_km2` is `nearest_range2` of these), and not in one spot with a tracklet.
     """
     if not looks_at(views, s, points.x_km, points.seen_by):
         return False
@@ -265,42 +264,41 @@ def score(space, work, members, near):
     else:
         total, fragments = arc_odds(views, chance, members, points)
     total += np.log(chance.objects_km3) + _altitude_weight(points.x_km[m], space.shells)
-    total += _magnitude_odds(views, members, points)
+    total += _magnitude_odds(views, work, members)
     detections, n_missed = _detections(space, work, members, near)
     return total + detections, fragments, n_missed
 
 
 @kernel
-def _magnitude_odds(views, members, points):
+def _magnitude_odds(views, work, members):
     """Return the log-odds of one object against unrelated ones by the magnitudes of tracklets.
 
-    `members` (n,) are the tracklets, `points` their `InstantPoints`. All magnitudes are reduced to
-    one range. Each sensor's first one is compared with that of the sensor that sees the object
+    `members` (n,) are the tracklets of the points of `work`. All magnitudes are reduced to one
+    range. Each sensor's first one is compared with that of the sensor that sees the object
     from the nearest direction, of those before it: 0 if there is none. The order is that of the
     tracklets, so that the odds do not depend on which of them were the seed.
     """
-    total, n, seen_from = 0.0, 0, np.empty((len(members), 5))
+    points, mark = work.points, next_mark(work.stamp)
+    total, n, seen_from = 0.0, 0, np.empty((len(members), 4))
     for i in np.sort(members):
-        m = 0
+        s, m = views.sensor[i], 0
         while m < len(views.time_s) and not (points.seen_by[m] >= 2 and views.seen[i, m]):
             m += 1
-        if m == len(views.time_s) or np.isnan(views.magnitude[i]):
+        if m == len(views.time_s) or np.isnan(views.magnitude[i]) or work.stamp[s] == mark:
             continue
-        s, square, cosine, nearest, again = views.sensor[i], 0.0, -np.inf, 0, False
+        work.stamp[s] = mark
+        square, cosine, nearest = 0.0, -np.inf, 0
         for a in range(3):
             seen_from[n, a] = views.camera[s, m, a] - points.x_km[m, a]
             square += seen_from[n, a] ** 2
         seen_from[n, :3] /= np.sqrt(square)
-        seen_from[n, 3], seen_from[n, 4] = views.magnitude[i] - 2.5 * np.log10(square), s
+        seen_from[n, 3] = views.magnitude[i] - 2.5 * np.log10(square)
         for k in range(n):
-            again |= seen_from[k, 4] == s
             here = 0.0
             for a in range(3):
                 here += seen_from[k, a] * seen_from[n, a]
             if here > cosine:
                 cosine, nearest = here, k
-        if again:
-            continue
         if n > 0:
             total += _same_magnitude(seen_from[n, 3] - seen_from[nearest, 3], cosine)
         n += 1
