@@ -263,9 +263,9 @@ class _Search:
     def take(self, hypotheses: list[Hypothesis], min_log_odds: float) -> None:
         """Accept hypotheses, the likeliest first; members that a rival also has are ambiguous."""
         taken = self.space.taken
-        intact, broken = [], []  # some may have lost tracklets to a clear group
-        for h in hypotheses:
-            (broken if taken[list(h.members)].any() else intact).append(h)
+        # Some may have lost tracklets to a clear group.
+        broken = [h for h in hypotheses if taken[list(h.members)].any()]
+        intact = [h for h in hypotheses if not taken[list(h.members)].any()]
         queue = HypothesisQueue(intact + self._grow_again(broken))
         while (best := queue.pop()) is not None and best.score >= min_log_odds:
             if taken[list(best.members)].any():
