@@ -42,7 +42,7 @@ from epipole.tasks.algorithms.geometry.directions import (
     matrix_from_quaternion,
 )
 from epipole.tasks.algorithms.tracking.attributables import MAX_HALF_S
-from epipole.tasks.algorithms.tracking.local_motion import directions_at
+from epipole.tasks.algorithms.tracking.local_motion import LocalMotion, directions_at
 from epipole.tasks.common.grouping import group_offsets
 from epipole.tasks.common.sightings import (
     Frames,
@@ -133,24 +133,11 @@ def _view_table(
 ) -> pa.Table:
     frames, tracklets, camera = sightings.frames, sightings.tracklets, sightings.camera
     tracklet, row, frame = query
-    origin = frames.time_ns[0]
-    bounds = tracklets.bounds
     v = np.nan_to_num(frames.v_gcrf_km_s)
-    u_still = aberrate(tracklets.u_icrs, -v[tracklets.frame])
-    at_s = (array(epochs, "epoch")[row] - origin) / 1e9
-    motion = directions_at(
-        bounds[tracklet],
-        bounds[tracklet + 1],
-        at_s,
-        np.radians(max_rate_deg_s) / 3,  # the maximum is a 3-sigma rate
-        (tracklets.time_ns - origin) / 1e9,
-        u_still,
-        tracklets.cov_noise,
-        tracklets.cov_bias,
-        half_width_s,
-    )
+    at_s = (array(epochs, "epoch")[row] - frames.time_ns[0]) / 1e9
+    motion = _motions(sightings, query, at_s, max_rate_deg_s, half_width_s)
     centroid, missed = _centroids(tracklets, query)
-    frame_s, u, fitted = (frames.time_ns - origin) / 1e9, motion.u, motion.fitted
+    frame_s, u, fitted = (frames.time_ns - frames.time_ns[0]) / 1e9, motion.u, motion.fitted
     R = matrix_from_quaternion(interpolate_quaternions(frame_s, frames.q_sensor_from_icrs, at_s))
     u_sensor = np.einsum("nij,nj->ni", R, aberrate(u, v[frame]))
     x_px, y_px = project(camera, u_sensor)
@@ -194,6 +181,29 @@ def _view_table(
     columns |= {name: nullable(values[kept]) for name, values in maybe.items()}
     columns["centroid"] = pa.array(centroid[kept], mask=missed[kept])
     return table(VIEWS, columns)
+
+
+def _motions(
+    sightings: SensorSightings,
+    query: _EpochQueries,
+    at_s: Array,
+    max_rate_deg_s: float,
+    half_width_s: float,
+) -> LocalMotion:
+    """Return each query's motion without aberration, at seconds since the first frame."""
+    frames, tracklets, bounds = sightings.frames, sightings.tracklets, sightings.tracklets.bounds
+    v_km_s = np.nan_to_num(frames.v_gcrf_km_s)[tracklets.frame]
+    return directions_at(
+        bounds[query.tracklet],
+        bounds[query.tracklet + 1],
+        at_s,
+        np.radians(max_rate_deg_s) / 3,  # the maximum is a 3-sigma rate
+        (tracklets.time_ns - frames.time_ns[0]) / 1e9,
+        aberrate(tracklets.u_icrs, -v_km_s),
+        tracklets.cov_noise,
+        tracklets.cov_bias,
+        half_width_s,
+    )
 
 
 def _turn_noise(tracklets: TrackletSightings, fitted: Indices, cov_noise: Array) -> Array:
