@@ -17,7 +17,11 @@ from epipole.schemas.spans import Span, spans_between
 from epipole.schemas.tables import DETECTIONS
 from epipole.tasks.algorithms.constants import ARCSEC, SECOND_NS
 from epipole.tasks.algorithms.geometry.camera import Camera, row_offset_s, unproject
-from epipole.tasks.algorithms.geometry.covariances import attitude_covariance, centroid_covariance
+from epipole.tasks.algorithms.geometry.covariances import (
+    attitude_covariance,
+    centroid_covariance,
+    in_components,
+)
 from epipole.tasks.algorithms.geometry.directions import matrix_from_quaternion, unit_from_radec
 from epipole.tasks.algorithms.times import frame_interval_ns
 
@@ -102,7 +106,9 @@ def sightings_of(frames: Frames, detections: pa.Table, cameras: pa.Table) -> Sig
     )
     noise = centroid_covariance(u, array(detections, "sigma_arcsec")[row] * ARCSEC)
     R = matrix_from_quaternion(frames.q_sensor_from_icrs)
-    attitude = attitude_covariance(u, (np.swapaxes(R, -1, -2) @ frames.cov_att_rad2 @ R)[frame])
+    attitude = attitude_covariance(
+        u, in_components(np.swapaxes(R, -1, -2), frames.cov_att_rad2)[frame]
+    )
     stars = frames.from_stars[frame][:, None, None]
     return Sightings(
         row,

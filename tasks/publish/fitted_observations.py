@@ -17,6 +17,7 @@ from epipole.schemas.stages import Stage
 from epipole.schemas.tables import OBSERVATIONS
 from epipole.schemas.work_tables import FITTED_OBSERVATIONS
 from epipole.tasks.algorithms.constants import SECOND_NS, SPEED_OF_LIGHT_KM_S
+from epipole.tasks.algorithms.geometry.directions import lengths
 from epipole.tasks.algorithms.orbits.forces import Surroundings
 from epipole.tasks.algorithms.orbits.illumination import illumination, reduced_magnitude
 from epipole.tasks.algorithms.orbits.orbit_determination import BACK_S
@@ -92,7 +93,7 @@ def _by_orbit(fitted: FittedOrbit, time_s: Array, sensor_km: Array, around: Surr
     delay_s = np.zeros(len(time_s))
     for _ in range(LIGHT_ITERATIONS):
         r_km = turned(R, positions_at(path, time_s - delay_s))
-        delay_s = np.linalg.norm(r_km - sensor_km, axis=1) / SPEED_OF_LIGHT_KM_S
+        delay_s = lengths(r_km - sensor_km) / SPEED_OF_LIGHT_KM_S
     return r_km
 
 
@@ -110,7 +111,7 @@ def _by_positions(positions: pl.DataFrame, time_ns: Integers, sensor_km: Array) 
         r_km = np.column_stack([np.interp(at_s, solved_s, axis) for axis in known.T])
         step_s = np.diff(solved_s, append=np.inf)[after - 1]
         r_km[~(inside & (step_s <= MAX_APART_S))] = np.nan
-        distance_km = np.linalg.norm(r_km - sensor_km, axis=1)
+        distance_km = lengths(r_km - sensor_km)
         delay_s = np.nan_to_num(distance_km / SPEED_OF_LIGHT_KM_S)
     return r_km
 

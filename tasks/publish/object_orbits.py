@@ -173,11 +173,18 @@ def observed_objects(rows: pl.DataFrame, origin_ns: int, around: Surroundings) -
         views=ObjectDirections(
             (time_ns - origin_ns) / SECOND_NS, sensors.rank,
             turned(R, rows.select(POSITION).to_numpy()), turned(R, u), turned(R, east_north(u)),
-            np.asarray(np.linalg.inv(cov), float),
+            _inverses(cov),
             np.zeros((0, 6, 6)),
         ),
         cov_shared=np.maximum(shared, smallest) ** 2,
     )  # fmt: skip
+
+
+def _inverses(cov: Array) -> Array:
+    """Return the inverses of (n, 2, 2) symmetric matrices."""
+    a, b, c = cov[:, 0, 0], cov[:, 0, 1], cov[:, 1, 1]
+    inverse = np.array([[c, -b], [-b, a]]) / (a * c - b * b)
+    return np.ascontiguousarray(np.moveaxis(inverse, 2, 0))
 
 
 def best_orbit(

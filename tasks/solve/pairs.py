@@ -6,7 +6,7 @@ import pyarrow as pa
 from epipole.schemas.arrays import Array, Flags, Indices
 from epipole.schemas.bridge import table
 from epipole.schemas.tables import ASSOCIATIONS, PAIRS
-from epipole.tasks.algorithms.geometry.directions import tangent_basis
+from epipole.tasks.algorithms.geometry.directions import lengths
 from epipole.tasks.algorithms.geometry.epipolar import (
     UncertainSight,
     epipolar_angle,
@@ -69,7 +69,7 @@ def _position_error(groups: ViewGroups) -> Array:
     """Return the square of the error that each view alone leaves at the object [km^2]."""
     views = groups.views
     across = np.trace(views.cov, axis1=1, axis2=2) / 2
-    range_km = np.linalg.norm(groups.x_km[groups.group] - views.r_km, axis=1)
+    range_km = lengths(groups.x_km[groups.group] - views.r_km)
     return across * range_km**2 + views.sigma_km**2
 
 
@@ -103,12 +103,9 @@ def _distances(groups: ViewGroups, first: Indices, second: Indices) -> tuple[Arr
     views = groups.views
     r, u = _seen_together(groups), views.u
     angle = np.abs(epipolar_angle(r[first], u[first], r[second], u[second]))
-    basis = tangent_basis(u)
-    cov = np.swapaxes(basis, -1, -2) @ views.cov @ basis
-    sigma_km = views.sigma_km
-    sigma = epipolar_sigma(
-        UncertainSight(r[first], u[first], cov[first], sigma_km[first]),
-        UncertainSight(r[second], u[second], cov[second], sigma_km[second]),
-        groups.x_km[groups.group[first]],
+    one, two = (
+        UncertainSight(r[rows], u[rows], views.cov[rows], views.sigma_km[rows])
+        for rows in (first, second)
     )
+    sigma = epipolar_sigma(one, two, groups.x_km[groups.group[first]])
     return angle / views.pixel_rad[second], angle / sigma

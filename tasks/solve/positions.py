@@ -10,6 +10,7 @@ from epipole.schemas.rejects import Reason, reject_rows
 from epipole.schemas.spans import Span
 from epipole.schemas.tables import POSITIONS, REJECTS
 from epipole.tasks.algorithms.constants import SPEED_OF_LIGHT_KM_S
+from epipole.tasks.algorithms.geometry.directions import lengths
 from epipole.tasks.algorithms.geometry.triangulation import triangulate
 from epipole.tasks.algorithms.orbits.object_motion import (
     keep_independent,
@@ -99,17 +100,17 @@ def with_neglected_motion(
     sensor = np.hstack([views.r_km, views.v_km_s])
     moments, neglected = views.moments, views.unmodelled
     correction = neglected_motion(state, sensor, moments)
-    range_km = np.linalg.norm(state[:, :3] - sensor[:, :3], axis=1)
-    speed = np.linalg.norm(state[:, 3:] - sensor[:, 3:], axis=1)
+    range_km = lengths(state[:, :3] - sensor[:, :3])
+    speed = lengths(state[:, 3:] - sensor[:, 3:])
     with np.errstate(divide="ignore", invalid="ignore"):
         error = sigma_km / (spread_s * range_km) * (
             np.abs(moments[:, 0]) + np.abs(moments[:, 1]) * speed / range_km
         )  # fmt: skip
-        error = np.hypot(error, np.linalg.norm(correction, axis=1) * sigma_km / range_km)
+        error = np.hypot(error, lengths(correction) * sigma_km / range_km)
     known = error**2 < neglected
     correction[~known] = 0.0
     u = views.u - correction
-    u /= np.linalg.norm(u, axis=1, keepdims=True)
+    u /= lengths(u)[:, None]
     removed = np.where(known, neglected - error**2, 0.0)
     cov = views.cov_noise - removed[:, None, None] * np.eye(2)
     return views._replace(u=u, cov_noise=cov, unmodelled=neglected - removed)

@@ -23,12 +23,14 @@ from epipole.tasks.algorithms.geometry.covariances import (
     attitude_covariance,
     centroid_covariance,
     few_stars_covariance,
+    in_components,
     scatter_beyond,
     shared_direction_covariance,
 )
 from epipole.tasks.algorithms.geometry.directions import (
     aberrate,
     east_north,
+    lengths,
     matrix_from_quaternion,
     radec_from_unit,
 )
@@ -169,7 +171,7 @@ def optics_covariance(
     of_attitude = few_stars_covariance(camera, cov_optics) / n_stars[:, None, None]
     turn = attitude_covariance(u_sensor, of_attitude)
     back = np.swapaxes(R, 1, 2)
-    return OpticsCovariances(back @ local @ R, back @ turn @ R)
+    return OpticsCovariances(in_components(back, local), in_components(back, turn))
 
 
 def _with_lone(frames: Frames, detections: pa.Table, settings: TrackletSettings) -> pa.Table:
@@ -341,7 +343,7 @@ def _with_image_trails(
 
 def _that_move(in_image: Array, time_s: Array, bounds: Indices) -> Indices:
     """Return the rows of the tracklets that move through the image by `IMAGE_TRAIL_RAD_S`."""
-    moved = np.linalg.norm(np.diff(in_image, axis=0), axis=1)
+    moved = lengths(np.diff(in_image, axis=0))
     way = np.concatenate([[0.0], np.cumsum(moved)])
     first, last = bounds[:-1], bounds[1:] - 1
     fast = way[last] - way[first] > IMAGE_TRAIL_RAD_S * (time_s[last] - time_s[first])
@@ -518,14 +520,13 @@ def states_near_frames(frames: Frames, served: Indices, dt_s: Array) -> tuple[Ar
     """
     r, v = frames.r_gcrf_km[served], frames.v_gcrf_km_s[served]
     back = -dt_s[:, None]
-    gravity = -GM_KM3_S2 * r / np.linalg.norm(r, axis=1, keepdims=True) ** 3
+    gravity = -GM_KM3_S2 * r / lengths(r)[:, None] ** 3
     return r + np.nan_to_num(v) * back + gravity * back**2 / 2, v + gravity * back
 
 
 def _on_sky(u: Array, cov: Array) -> Array:
     """Return (n, 3, 3) covariances as (n, 2, 2), east and north."""
-    basis = east_north(u)
-    return basis @ cov @ np.swapaxes(basis, 1, 2)
+    return in_components(east_north(u), cov)
 
 
 def magnitudes(sightings: SensorSightings) -> tuple[Array, Array]:

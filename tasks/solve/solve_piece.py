@@ -68,18 +68,18 @@ def gather_views(
     has a view of the object are left out.
     """
     tables, numbers, sensors = [], [], []
-    for sensor, members_of_sensor in to_polars(members).group_by("sensor", maintain_order=True):
+    for sensor, members_of_sensor in _by_sensor(members, time):
+        parts = viewed[sensor]
         for span in spans_between(*time):
-            if not viewed[int(sensor[0])].holds(span):
+            if not parts.holds(span):
                 continue
-            parts = viewed[int(sensor[0])]
             views = parts.read(span, "views")
-            rows, number = _rows(views, parts.read(span, "tracklets"), members_of_sensor, time)
+            rows, number = _rows(views, parts.read(span, "tracklets"), members_of_sensor)
             kept = array(views, "epoch")[rows] % DAY_NS % every_ns == 0
             rows, number = rows[kept], number[kept]
             tables.append(with_position_error(views.take(rows), more_km))
             numbers.append(number)
-            sensors.append(np.full(len(number), sensor[0]))
+            sensors.append(np.full(len(number), sensor))
     views = concat(VIEWS, tables)
     number, sensor_number = (
         np.concatenate([*parts, np.zeros(0, np.int64)]) for parts in (numbers, sensors)
@@ -88,8 +88,33 @@ def gather_views(
     return views.take(kept), number[kept]
 
 
+class _Member(NamedTuple):
+    """A tracklet of an object, with the first and the last epoch at which it is one."""
+
+    tracklet_id: str
+    number: int  # of the object
+    first_ns: int
+    last_ns: int
+
+
+def _by_sensor(members: pa.Table, time: Span) -> Iterator[tuple[int, list[_Member]]]:
+    """Yield each sensor with its members of OBJECT_MEMBERS within a time, in their order."""
+    sensor = array(members, "sensor")
+    columns = (
+        members["tracklet_id"].to_pylist(),
+        array(members, "object").tolist(),
+        np.maximum(array(members, "first_epoch"), time.start_ns).tolist(),
+        np.minimum(array(members, "last_epoch"), time.end_ns - 1).tolist(),
+    )
+    rows = [_Member(*row) for row in zip(*columns, strict=True)]
+    order = np.argsort(sensor, kind="stable")
+    for at in np.split(order, np.flatnonzero(np.diff(sensor[order])) + 1):
+        if len(at):
+            yield int(sensor[at[0]]), [rows[k] for k in at]
+
+
 def _rows(
-    views: pa.Table, tracklets: pa.Table, members: pl.DataFrame, time: Span
+    views: pa.Table, tracklets: pa.Table, members: Sequence[_Member]
 ) -> tuple[Indices, Indices]:
     """Return the rows of one sensor's views that show objects, and the object of each."""
     epoch_ns = array(views, "epoch")
@@ -98,7 +123,7 @@ def _rows(
     n_views = array(tracklets, "n_views")
     count = dict(zip(first, n_views.tolist(), strict=True))
     rows, numbers = [np.zeros(0, np.int64)], [np.zeros(0, np.int64)]
-    for name, number, start_ns, end_ns in _member_times(members, time):
+    for name, number, start_ns, end_ns in members:
         if name not in first:
             continue
         begin, end = first[name], first[name] + count[name]
@@ -107,17 +132,6 @@ def _rows(
         rows.append(np.arange(lo, hi))
         numbers.append(np.full(hi - lo, number))
     return np.concatenate(rows), np.concatenate(numbers)
-
-
-def _member_times(members: pl.DataFrame, time: Span) -> Iterator[tuple[str, int, int, int]]:
-    """Yield tracklet, object, first and last epoch of each member within a time."""
-    columns = members.select(
-        "tracklet_id",
-        "object",
-        pl.col("first_epoch").cast(pl.Int64).clip(lower_bound=time.start_ns),
-        pl.col("last_epoch").cast(pl.Int64).clip(upper_bound=time.end_ns - 1),
-    )
-    yield from columns.iter_rows()
 
 
 def _seen_by_two(views: pa.Table, number: Indices, sensor: Indices) -> Indices:

@@ -38,8 +38,21 @@ def centroid_covariance(u_icrs: Array, sigma_rad: Array) -> Array:
     sigma_rad : (n,) float
         1-sigma error, per axis [rad].
     """
-    across = np.eye(3) - u_icrs[:, :, None] * u_icrs[:, None, :]
-    return across * np.square(sigma_rad)[:, None, None]
+    out = np.empty((len(u_icrs), 3, 3))
+    sigma = np.array(np.broadcast_to(sigma_rad, len(u_icrs)), float)
+    _across(np.array(u_icrs, float, order="C"), sigma, out)
+    return out
+
+
+@kernel
+def _across(u, sigma, out):
+    """Write `centroid_covariance` of u (n, 3) and `sigma` (n,) [rad] to `out` (n, 3, 3)."""
+    for i in range(len(u)):
+        variance = sigma[i] * sigma[i]
+        for a in range(3):
+            for b in range(3):
+                out[i, a, b] = -u[i, a] * u[i, b] * variance
+            out[i, a, a] += variance
 
 
 def attitude_covariance(u_icrs: Array, cov_icrs_rad2: Array) -> Array:
@@ -56,14 +69,50 @@ def attitude_covariance(u_icrs: Array, cov_icrs_rad2: Array) -> Array:
     -----
     A small rotation phi moves a direction by phi x u; the sign of phi does not matter.
     """
-    across = skew(u_icrs)
-    return across @ cov_icrs_rad2 @ np.swapaxes(across, -1, -2)
+    return in_components(skew(u_icrs), cov_icrs_rad2)
 
 
 def on_tangent_plane(u_icrs: Array, cov: Array) -> Array:
     """Return (n, 3, 3) covariances as (n, 2, 2) on `tangent_basis(u_icrs)`."""
-    basis = tangent_basis(u_icrs)
-    return basis @ cov @ np.swapaxes(basis, -1, -2)
+    return in_components(tangent_basis(u_icrs), cov)
+
+
+def in_components(basis: Array, cov: Array) -> Array:
+    """Return ``B @ C @ B.T`` of each two matrices.
+
+    Parameters
+    ----------
+    basis : (n, k, 3) float
+        New components by the old ones.
+    cov : (n, 3, 3) float
+        Covariances of the old components.
+
+    Returns
+    -------
+    (n, k, k) float
+        Covariances of the new components.
+
+    Notes
+    -----
+    Compiled: NumPy multiplies stacks of small matrices one by one, which takes ten times as long.
+    """
+    out = np.empty((len(basis), basis.shape[1], basis.shape[1]))
+    cov = np.array(np.broadcast_to(cov, (len(basis), 3, 3)), float, order="C")
+    _transform(np.array(basis, float, order="C"), cov, out)
+    return out
+
+
+@kernel
+def _transform(basis, cov, out):
+    """Write `in_components` of `basis` (n, k, 3) and `cov` (n, 3, 3) to `out` (n, k, k)."""
+    for i in range(len(basis)):
+        B, C = basis[i], cov[i]
+        for a in range(len(B)):
+            x = B[a, 0] * C[0, 0] + B[a, 1] * C[1, 0] + B[a, 2] * C[2, 0]
+            y = B[a, 0] * C[0, 1] + B[a, 1] * C[1, 1] + B[a, 2] * C[2, 1]
+            z = B[a, 0] * C[0, 2] + B[a, 1] * C[1, 2] + B[a, 2] * C[2, 2]
+            for b in range(len(B)):
+                out[i, a, b] = x * B[b, 0] + y * B[b, 1] + z * B[b, 2]
 
 
 def scatter_beyond(residual_rad: Array, sigma_rad: Array, leverage: Array, follows: Flags) -> float:

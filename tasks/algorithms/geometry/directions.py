@@ -8,6 +8,7 @@ import numpy as np
 
 from epipole.schemas.arrays import Array
 from epipole.tasks.algorithms.constants import SPEED_OF_LIGHT_KM_S
+from epipole.tasks.algorithms.kernels import kernel
 
 
 def matrix_from_quaternion(q: Array) -> Array:
@@ -51,7 +52,7 @@ def quaternion_from_matrix(R: Array) -> Array:
 
 def canonical(q: Array) -> Array:
     """Return unit quaternions of the same rotations with w >= 0."""
-    q = q / np.linalg.norm(q, axis=-1, keepdims=True)
+    q = q / lengths(q)[..., None]
     return np.where(q[..., 3:] < 0, -q, q)
 
 
@@ -109,8 +110,39 @@ def interpolate_quaternions(times: Array, q: Array, at: Array) -> Array:
         return np.repeat(canonical(q), len(at), axis=0)
     i = np.clip(np.searchsorted(times, at) - 1, 0, len(times) - 2)
     share = (at - times[i]) / (times[i + 1] - times[i])
-    turn = rotation_vector_from_quaternion(multiply(q[i + 1], conjugate(q[i])))
-    return canonical(multiply(quaternion_from_rotation_vector(turn * share[:, None]), q[i]))
+    out = np.empty((len(i), 4))
+    _interpolate(np.array(q, float, order="C"), i, share, out)
+    return out
+
+
+@kernel
+def _interpolate(q, row, share, out):
+    """Write the attitude at a share of the turn from row i to row i + 1 of q (n, 4) to `out`.
+
+    `row` (m,), `share` (m,), `out` (m, 4), canonical.
+    """
+    turn = np.empty(4)
+    for k in range(len(row)):
+        a, b = q[row[k]], q[row[k] + 1]
+        turn[0] = b[0] * a[3] - b[3] * a[0] - b[1] * a[2] + b[2] * a[1]
+        turn[1] = b[1] * a[3] - b[3] * a[1] - b[2] * a[0] + b[0] * a[2]
+        turn[2] = b[2] * a[3] - b[3] * a[2] - b[0] * a[1] + b[1] * a[0]
+        turn[3] = b[3] * a[3] + b[0] * a[0] + b[1] * a[1] + b[2] * a[2]
+        if turn[3] < 0.0:
+            turn *= -1.0
+        sine = np.sqrt(turn[0] * turn[0] + turn[1] * turn[1] + turn[2] * turn[2])
+        half = share[k] * np.arctan2(sine, turn[3])
+        # The sine of a share of a small angle is the share of the sine.
+        turn[:3] *= np.sin(half) / sine if sine > 1e-12 else share[k]
+        turn[3] = np.cos(half)
+        out[k, 0] = turn[3] * a[0] + turn[0] * a[3] + turn[1] * a[2] - turn[2] * a[1]
+        out[k, 1] = turn[3] * a[1] + turn[1] * a[3] + turn[2] * a[0] - turn[0] * a[2]
+        out[k, 2] = turn[3] * a[2] + turn[2] * a[3] + turn[0] * a[1] - turn[1] * a[0]
+        out[k, 3] = turn[3] * a[3] - turn[0] * a[0] - turn[1] * a[1] - turn[2] * a[2]
+        size = 0.0
+        for m in range(4):
+            size += out[k, m] * out[k, m]
+        out[k] /= np.sqrt(size) if out[k, 3] >= 0.0 else -np.sqrt(size)
 
 
 # Directions
@@ -154,17 +186,40 @@ def tangent_basis(u: Array) -> Array:
 
     Deterministic, without a degenerate direction, and smooth except at ``abs(u_z) = 0.9``.
     """
-    helper = np.where(np.abs(u[..., 2:]) < 0.9, [0.0, 0.0, 1.0], [1.0, 0.0, 0.0])
-    first = np.cross(helper, u)
-    first /= np.linalg.norm(first, axis=-1, keepdims=True)
-    return np.stack([first, np.cross(u, first)], axis=-2)
+    out = np.empty((*u.shape[:-1], 2, 3))
+    _tangent_basis(np.array(u, float, order="C").reshape(-1, 3), out.reshape(-1, 2, 3))
+    return out
+
+
+@kernel
+def _tangent_basis(u, out):
+    """Write `tangent_basis` of u (n, 3) to `out` (n, 2, 3)."""
+    for i in range(len(u)):
+        x, y, z = u[i, 0], u[i, 1], u[i, 2]
+        # At right angles to u and to the z axis, or to the x axis where u is near the z axis.
+        a, b, c = (-y, x, 0.0) if abs(z) < 0.9 else (0.0, -z, y)
+        length = np.sqrt(a * a + b * b + c * c)
+        a, b, c = a / length, b / length, c / length
+        out[i, 0, 0], out[i, 0, 1], out[i, 0, 2] = a, b, c
+        out[i, 1, 0], out[i, 1, 1], out[i, 1, 2] = y * c - z * b, z * a - x * c, x * b - y * a
 
 
 def east_north(u: Array) -> Array:
     """Return (..., 2, 3): the unit vectors towards growing right ascension and declination."""
-    ra, _ = radec_from_unit(u)
-    east = np.stack([-np.sin(ra), np.cos(ra), np.zeros_like(ra)], axis=-1)
-    return np.stack([east, np.cross(u, east)], axis=-2)
+    out = np.empty((*u.shape[:-1], 2, 3))
+    _east_north(np.array(u, float, order="C").reshape(-1, 3), out.reshape(-1, 2, 3))
+    return out
+
+
+@kernel
+def _east_north(u, out):
+    """Write `east_north` of u (n, 3) to `out` (n, 2, 3); at a pole as for right ascension 0."""
+    for i in range(len(u)):
+        x, y, z = u[i, 0], u[i, 1], u[i, 2]
+        across = np.sqrt(x * x + y * y)
+        a, b = (-y / across, x / across) if across != 0.0 else (0.0, 1.0)
+        out[i, 0, 0], out[i, 0, 1], out[i, 0, 2] = a, b, 0.0
+        out[i, 1, 0], out[i, 1, 1], out[i, 1, 2] = -z * b, z * a, x * b - y * a
 
 
 def boresight_angles(R_sensor_from_icrs: Array) -> tuple[Array, Array, Array]:
@@ -178,6 +233,14 @@ def boresight_angles(R_sensor_from_icrs: Array) -> tuple[Array, Array, Array]:
     to_east, to_north = np.einsum("...ij,...j->i...", east_north(boresight), up)
     roll = np.arctan2(to_east, to_north)
     return ra, dec, roll % (2 * np.pi)
+
+
+def lengths(v: Array) -> Array:
+    """Return the lengths (...) of vectors (..., k).
+
+    `numpy.linalg.norm` takes four times as long along a short axis.
+    """
+    return np.sqrt(np.einsum("...i,...i->...", v, v))
 
 
 # Light time
@@ -200,5 +263,5 @@ def apparent_positions(x_km: Array, v_km_s: Array, light_s: Array, r_km: Array) 
     (n, 3) float
         Positions [km], GCRF.
     """
-    delay_s = np.linalg.norm(x_km - r_km, axis=1) / SPEED_OF_LIGHT_KM_S
+    delay_s = lengths(x_km - r_km) / SPEED_OF_LIGHT_KM_S
     return np.asarray(x_km + v_km_s * (light_s - delay_s)[:, None])

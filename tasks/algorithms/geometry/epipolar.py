@@ -9,6 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from epipole.schemas.arrays import Array, Indices
+from epipole.tasks.algorithms.geometry.directions import lengths, tangent_basis
 from epipole.tasks.algorithms.kernels import kernel
 
 
@@ -19,8 +20,8 @@ class UncertainSight(NamedTuple):
         Sensor position [km].
     u : (..., 3) float
         Unit vector from the sensor to the object.
-    cov : (..., 3, 3) float
-        Covariance of the direction [rad^2], same axes.
+    cov : (..., 2, 2) float
+        Covariance of the direction [rad^2] on `tangent_basis(u)`.
     sigma_km : (...) float
         1-sigma error of the position, per axis [km].
     """
@@ -55,9 +56,9 @@ def epipolar_angle(r_1_km: Array, u_1: Array, r_2_km: Array, u_2: Array) -> Arra
     """
     baseline = r_2_km - r_1_km
     normal = np.cross(baseline, u_1)
-    length = np.linalg.norm(normal, axis=-1)
-    defined = length > 1e-12 * np.linalg.norm(baseline, axis=-1)  # below, it is rounding
-    sine = np.sum(normal * u_2, axis=-1) / np.where(defined, length, np.inf)
+    length = lengths(normal)
+    defined = length > 1e-12 * lengths(baseline)  # below, it is rounding
+    sine = np.einsum("...i,...i->...", normal, u_2) / np.where(defined, length, np.inf)
     return np.arcsin(np.clip(sine, -1.0, 1.0))
 
 
@@ -73,13 +74,20 @@ def epipolar_sigma(first: UncertainSight, second: UncertainSight, x_km: Array) -
         ranges.
     """
     normal = np.cross(first.u, second.u)
-    length = np.linalg.norm(normal, axis=-1, keepdims=True)
+    length = lengths(normal)[..., None]
     normal = normal / np.where(length > 0, length, 1.0)
-    range_1 = np.linalg.norm(x_km - first.r_km, axis=-1)
-    range_2 = np.linalg.norm(x_km - second.r_km, axis=-1)
-    across_1 = np.einsum("...i,...ij,...j", normal, first.cov, normal) * range_1**2
-    across_2 = np.einsum("...i,...ij,...j", normal, second.cov, normal) * range_2**2
-    return np.sqrt(across_1 + across_2 + first.sigma_km**2 + second.sigma_km**2) / range_2
+    variance_km2 = sum(
+        _variance_along(normal, sight) * lengths(x_km - sight.r_km) ** 2 + sight.sigma_km**2
+        for sight in (first, second)
+    )
+    return np.asarray(np.sqrt(variance_km2) / lengths(x_km - second.r_km))
+
+
+def _variance_along(axis: Array, sight: UncertainSight) -> Array:
+    """Return the variance of directions along unit vectors (..., 3) at right angles to them."""
+    a, b = np.moveaxis(np.einsum("...ai,...i->...a", tangent_basis(sight.u), axis), -1, 0)
+    aa, ab, bb = (sight.cov[..., i, j] for i, j in ((0, 0), (0, 1), (1, 1)))
+    return np.asarray(a * a * aa + 2 * a * b * ab + b * b * bb)
 
 
 @kernel

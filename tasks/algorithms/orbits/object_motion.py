@@ -14,6 +14,7 @@ import numpy as np
 
 from epipole.schemas.arrays import Array, Indices, Integers
 from epipole.tasks.algorithms.earth_gravity import gravity
+from epipole.tasks.algorithms.geometry.directions import lengths
 from epipole.tasks.algorithms.kernels import kernel
 
 
@@ -96,7 +97,7 @@ def neglected_motion(object_state: Array, sensor_state: Array, moments: Array) -
     at = [
         a - b for a, b in zip(_derivatives(object_state), _derivatives(sensor_state), strict=True)
     ]
-    reach = np.linalg.norm(at[0], axis=1, keepdims=True)
+    reach = lengths(at[0])[:, None]
     away, rate, bend, jerk = (derivative / reach for derivative in at)
 
     def along(a: Array, b: Array) -> Array:

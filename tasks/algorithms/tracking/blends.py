@@ -7,7 +7,6 @@ it has ended or not yet begun. Its predicted direction shows which detections ma
 large their errors may be.
 """
 
-from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
@@ -153,10 +152,17 @@ def _usual_flux(tracked: TrackedDetections, blended: Flags) -> Array:
     """Return the median flux of each tracklet's unblended detections; NaN if unknown."""
     out = np.full(len(tracked.bounds) - 1, np.nan)
     known = ~blended & np.isfinite(tracked.flux)
-    for k, (first, last) in enumerate(pairwise(tracked.bounds)):
-        if known[first:last].any():
-            out[k] = np.median(tracked.flux[first:last][known[first:last]])
+    _medians(tracked.bounds, np.ascontiguousarray(tracked.flux), known, out)
     return out
+
+
+@kernel
+def _medians(bounds, values, known, out):
+    """Write the median of each tracklet's known values (n,) to `out` (t,); `bounds` (t + 1,)."""
+    for k in range(len(out)):
+        some = values[bounds[k] : bounds[k + 1]][known[bounds[k] : bounds[k + 1]]]
+        if len(some):
+            out[k] = np.median(some)
 
 
 @kernel

@@ -10,6 +10,7 @@ from typing import NamedTuple
 import numpy as np
 
 from epipole.schemas.arrays import Array, Integers
+from epipole.tasks.algorithms.geometry.directions import lengths
 from epipole.tasks.algorithms.kernels import kernel
 from epipole.tasks.algorithms.symmetric_matrices import invert_symmetric
 from epipole.tasks.algorithms.tracking.sky_filter import BEND_SHARE, acceleration, jerk
@@ -320,5 +321,5 @@ def directions_at(
         np.empty((q, 2), np.int64), np.zeros((q, 3)), np.empty(q),
     )  # fmt: skip
     _evaluate(queries, detections, fits)
-    u = fits.u / np.linalg.norm(fits.u, axis=1, keepdims=True)
+    u = fits.u / lengths(fits.u)[:, None]
     return LocalMotion(u, fits.w, fits.noise, fits.bias, fits.fitted, fits.moments, fits.unmodelled)

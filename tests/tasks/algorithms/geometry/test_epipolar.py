@@ -42,8 +42,9 @@ def test_its_sigma_is_honest_over_many_trials():
     noisy_1 = u_1 + np.einsum("nij,nj->ni", cov[0] / sigma, rng.normal(size=(n, 3)))
     noisy_2 = u_2 + np.einsum("nij,nj->ni", cov[1] / sigma, rng.normal(size=(n, 3)))
     angle = epipolar_angle(r_1, look(0, noisy_1), r_2, look(0, noisy_2))
-    first = UncertainSight(R_1, u_1, cov[0], np.array(place))
-    second = UncertainSight(R_2, u_2, cov[1], np.array(place))
+    on_plane = np.tile(sigma**2 * np.eye(2), (n, 1, 1))
+    first = UncertainSight(R_1, u_1, on_plane, np.array(place))
+    second = UncertainSight(R_2, u_2, on_plane, np.array(place))
     claimed = epipolar_sigma(first, second, GEO)
     assert abs(np.std(angle / claimed) - 1) < 0.05
 
