@@ -25,6 +25,7 @@ from epipole.tasks.algorithms.star_identification.star_pairs import TURN, range_
 GATE, MAG_GATE = 2.0, 2.0  # of a pair's separation [sigma], of brightness [1-sigma scatter]
 MIN_BINS_LOG2, MAX_BINS_LOG2 = 4, 8  # of roll, in a full turn
 MAX_MEAN_VOTES = 0.1  # per cell: false votes seldom agree then
+MAX_CELL_VOTES = 255  # in one cell, which has a byte; further ones are not counted
 
 
 class Votes(NamedTuple):
@@ -32,7 +33,8 @@ class Votes(NamedTuple):
 
     cast : (stars << MAX_BINS_LOG2,) uint8, the votes of each cell: that of a star and one of 2^log2
         bins of roll is number (star << log2) + bin
-    reached : (256,) int64, reached[v] cells have v votes or more; counted from v = 2 on
+    reached : (MAX_CELL_VOTES + 2,) int64, reached[v] cells have v votes or more; counted from v = 2
+        on. The last one is 0: a search for a number that few cells reach ends there
     companion, low, high : (n,) int64, the companions, rows of the centroids, and the ranges of the
         pairs with their separation
     angle, wide : (n,) int64, their position angles about the pivot and the tolerances of these, in
@@ -53,7 +55,7 @@ def make_votes(n_stars, n):
     """Return room for the votes of n companions (compiled)."""
     return Votes(
         np.empty(n_stars << MAX_BINS_LOG2, np.uint8),
-        np.empty(256, np.int64),
+        np.empty(MAX_CELL_VOTES + 2, np.int64),
         np.empty(n, np.int64),
         np.empty(n, np.int64),
         np.empty(n, np.int64),
@@ -192,7 +194,9 @@ def _cast(star, turn, wide, log2, votes):
     shift, mask = 16 - log2, (1 << log2) - 1
     for k in range((turn - wide) >> shift, ((turn + wide) >> shift) + 1):
         cell = (star << log2) + (k & mask)
-        count = votes.cast[cell] + np.uint8(1)
+        count = votes.cast[cell] + np.uint8(1)  # numba's sum has more than a byte
+        if count > MAX_CELL_VOTES:
+            continue
         votes.cast[cell] = count
         if count > 1:  # one vote is never enough
             votes.reached[count] += 1
