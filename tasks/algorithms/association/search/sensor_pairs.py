@@ -159,6 +159,7 @@ def _overlapping_pairs(index, rank, cones, steps):
         cells = index.by_sensor_cell[index.by_sensor_first[s] : index.by_sensor_first[s + 1]]
         order = np.argsort(occupied[cells], kind="mergesort")
         tested[s], count, tests = s, 0, 0
+        # First the crowded cells, from the fullest on; then all, from the emptiest on.
         for turn in range(2 * len(cells)):
             crowded = turn < len(cells)
             q = cells[order[len(cells) - 1 - turn]] if crowded else cells[order[turn - len(cells)]]
@@ -332,8 +333,9 @@ class SensorPairs:
         across = np.linalg.norm(np.cross(baseline, look[a] + look[b]), axis=1) / 2
         order = np.flatnonzero(known)[np.argsort(-across[known], kind="stable")]
         self._a, self._b = a[order], b[order]
-        middle, many = (look, position, half), n_overlapping > FEW_SENSORS
+        middle, many = (look, position, half), n_overlapping > FEW_SENSORS  # in crowded space
         few = ~many[self._a] & ~many[self._b]
+        # Points of the shared space: one in the middle, others at the edges where few sensors are.
         self._points = np.full((len(order), 1 + N_EDGES, 3), np.nan)
         self._points[:, 0] = _middle_points(middle, many, self._a, self._b, farthest_km)
         self._points[few, 1:] = _shared_points(
@@ -350,7 +352,7 @@ class SensorPairs:
         self._covered = np.where(shared, 0, np.iinfo(np.int64).max)
         self._index = index
         cell = _cells_of(index, self._points)
-        self._by_cell = np.argsort(cell, axis=None, kind="stable")
+        self._by_cell = np.argsort(cell, axis=None, kind="stable")  # see `_cover`
         self._first = np.searchsorted(cell.ravel()[self._by_cell], np.arange(len(index.first)))
         self._next = 0
 
