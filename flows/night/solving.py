@@ -28,13 +28,13 @@ from epipole.tasks.solve.solve_piece import Piece, judge_span, solve_piece
 from epipole.tasks.solve.views import view_sensors
 
 STEPS = 5  # of the stage, for the progress line
-MARGIN_NS = round(VELOCITY_WINDOW_S * 1e9)  # beyond a span: its positions show an object's motion
-MIN_EPOCHS = 6  # minimum number in a margin, where epochs are far apart
-VIEWS_AT_ONCE = 4  # tasks of views are smaller than a task may be by this: they spread evenly
+MARGIN_NS = round(VELOCITY_WINDOW_S * 1e9)  # time beyond a span, see `_Night.margin_ns`
+MIN_EPOCHS = 6  # minimum number in this margin, where epochs are far apart
+VIEWS_AT_ONCE = 4  # a task of views has this part of what a task may have: they spread evenly
 # Maximum number of views of a span from which the errors of its sensors are estimated. Not a
 # setting: positions do not depend on the memory of a task.
 MAX_JUDGED = 100_000
-MAX_LINES = 30_000  # lines of sight of a span that are kept for the check of the sensors, about
+MAX_LINES = 30_000  # about this number of a span's lines of sight is kept for the check of sensors
 
 
 class _Night(NamedTuple):
@@ -66,7 +66,7 @@ class _Night(NamedTuple):
 
     @property
     def apart_ns(self) -> int:
-        """Interval of epochs that share no detection: multiples of it. 1: all epochs [ns]."""
+        """Epochs at multiples of this time [ns] share no detection; 1: no two epochs do."""
         return 1 if self.grid.epochs_ns is not None else self.epochs_apart * self.grid.interval_ns
 
 

@@ -18,12 +18,11 @@ class KernelLocator(_CacheLocator):
 
     def __init__(self, function: Callable[..., Any], folder: Path) -> None:
         """Take the folder of the kernel's module."""
-        self._path, self._line = folder, function.__code__.co_firstlineno
-        self._py_file = (
-            function.__code__.co_filename
-        )  # numba names it where it cannot keep a kernel
-        with contextlib.suppress(OSError):  # it is not there yet
-            os.utime(folder)  # it is in use
+        code = function.__code__
+        self._path, self._line = folder, code.co_firstlineno
+        self._py_file = code.co_filename  # numba names it where it cannot keep a kernel
+        with contextlib.suppress(OSError):  # the folder may not exist yet
+            os.utime(folder)  # shows that it is in use
 
     @classmethod
     def from_function(cls, py_func: Callable[..., Any], py_file: str) -> "KernelLocator | None":
@@ -36,11 +35,11 @@ class KernelLocator(_CacheLocator):
         return str(self._path)
 
     def get_source_stamp(self) -> str:
-        """Return the same for all: the name of the folder changes with the code."""
+        """Return the folder's name: it changes with the code of the module."""
         return self._path.name
 
     def get_disambiguator(self) -> str:
-        """Return what tells functions of one name in a module apart."""
+        """Return the line: it distinguishes functions of one name in a module."""
         return str(self._line)
 
 

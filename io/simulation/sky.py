@@ -27,7 +27,8 @@ class SkyStars(NamedTuple):
     epoch: float  # Julian year
 
 
-# First and last byte of the columns, CDS I/311 ReadMe, hip2.dat.
+# Columns of hip2.dat of CDS I/311: first byte and the one after the last, counted from 0 (its
+# ReadMe counts from 1). Right ascension and declination are in radians.
 _COLUMNS = {
     "star_id": (0, 6),
     "ra": (15, 28),

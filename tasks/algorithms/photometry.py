@@ -14,15 +14,15 @@ from epipole.schemas.arrays import Array, Indices
 
 MIN_VALUES = 20  # minimum number of residuals for an estimate of the variance
 MIN_PER_BIN = 25  # minimum number of residuals per bin of flux
-MAX_BINS = 8
+MAX_BINS = 8  # maximum number of bins of flux
 UNKNOWN_STAR_MAG2 = 0.3**2  # variance of a star with too few residuals: colours, variables
-MIN_MAG2 = 1e-8
+MIN_MAG2 = 1e-8  # minimum of a variance: weights stay finite
 CLIP_SIGMA = 3.5  # larger residuals: variable, blended or wrong in the catalogue
 REJECTED_WEIGHT = 1e-6  # factor of the weight beyond `CLIP_SIGMA`
 ITERATIONS = 3  # of zero points and their variance model
-MAX_LEVERAGE = 0.8  # largest weight of a star image in the means that are subtracted from it
-MAX_IMAGES = 5000  # maximum number of images of repeatedly measured stars: more do not help
-SWEEPS = 10  # alternating over frames and stars: each subtracts the mean residuals
+MAX_LEVERAGE = 0.8  # largest share of a star image in the means that are subtracted from it
+MAX_IMAGES = 5000  # star images that show the error of fluxes, and the rest of the frame: enough
+SWEEPS = 10  # each subtracts the mean residuals of frames, then those of stars
 GAUSSIAN = 1.4826  # standard deviation over median absolute deviation
 
 
@@ -92,7 +92,8 @@ def _repeat_variance(
     """Return (floor, photon) of a flux's variance, from stars that are measured repeatedly.
 
     It is the scatter about an offset of each star plus one of each frame. None if too few stars are
-    measured repeatedly.
+    measured repeatedly. `offset` (n,) [mag] is the magnitude in the catalogue less that of the flux
+    alone.
     """
     some = frame <= np.sort(frame)[: MAX_IMAGES + 1].max(initial=-1)  # whole frames
     frame, offset, flux = frame[some], offset[some], flux[some]
@@ -125,6 +126,7 @@ def _with_others(residual: Array, flux: Array, count: Indices) -> tuple[Array, A
 
 
 def _medians(group: Indices, value: Array, n: int) -> Array:
+    """Return the median of the values of each of n groups, (n,); NaN for a group without values."""
     order = np.lexsort((value, group))
     count = np.bincount(group, minlength=n)
     first = np.cumsum(count) - count
@@ -136,7 +138,7 @@ def _medians(group: Indices, value: Array, n: int) -> Array:
 
 
 def _variance_by_flux(residual: Array, flux: Array) -> tuple[float, float]:
-    """Return (floor, photon) of the variance ``floor + photon / flux``, from medians by flux."""
+    """Return (floor, photon) of the variance ``floor + photon / flux``, by bins of flux."""
     if len(residual) < MIN_VALUES:
         return UNKNOWN_STAR_MAG2, 0.0
     n_bins = int(np.clip(len(residual) // MIN_PER_BIN, 1, MAX_BINS))
@@ -157,7 +159,7 @@ def _variance_by_flux(residual: Array, flux: Array) -> tuple[float, float]:
 
 def _medians_of_parts(values: Array, n_parts: int) -> Array:
     """Return the medians of parts of about the same length, as of `numpy.array_split`."""
-    length, longer = divmod(len(values), n_parts)
+    length, longer = divmod(len(values), n_parts)  # `longer` parts have one more
     head, tail = np.split(values, [longer * (length + 1)])
     rows = head.reshape(longer, length + 1), tail.reshape(n_parts - longer, length)
     return np.concatenate([np.median(part, axis=1) for part in rows])

@@ -25,8 +25,9 @@ from epipole.tasks.algorithms.orbits.trajectories import integrate, positions_at
 from epipole.tasks.common.stage_tasks import stage_task
 from epipole.tasks.publish.object_orbits import FittedOrbit, turned
 
-MAX_APART_S = 30.0  # positions between which a straight line is right: within 1 km in low orbit
-LIGHT_ITERATIONS = 3  # right to 1e-12 of the distance
+# Maximum time between positions that a straight line joins: it is within 1 km in low orbit.
+MAX_APART_S = 30.0
+LIGHT_ITERATIONS = 3  # of the light time: right to 1e-12 of the distance
 
 
 def fitted_part(folder: Path, share: int, shares: int) -> Path:
@@ -86,7 +87,7 @@ def _times(rows: pl.DataFrame) -> Integers:
 
 
 def _by_orbit(fitted: FittedOrbit, time_s: Array, sensor_km: Array, around: Surroundings) -> Array:
-    """Return the positions (n, 3), GCRF, of an object when the light left that came at times."""
+    """Return where an object was when the light left that came at times, (n, 3) [km], GCRF."""
     first_s, last_s = float(time_s.min()) - BACK_S, float(time_s.max())
     path = integrate(fitted.orbit.unknowns, fitted.epoch_s, first_s, last_s, around)
     R = around.R_night_from_gcrf.T
@@ -98,8 +99,8 @@ def _by_orbit(fitted: FittedOrbit, time_s: Array, sensor_km: Array, around: Surr
 
 
 def _by_positions(positions: pl.DataFrame, time_ns: Integers, sensor_km: Array) -> Array:
-    """Return the same between positions; NaN where none are near."""
-    solved_ns = _times(positions)
+    """Return the same, on straight lines between positions; NaN where none are near in time."""
+    solved_ns, known = _times(positions), positions.select(POSITION).to_numpy()
     solved_s, time_s = ((t - solved_ns[0]) / SECOND_NS for t in (solved_ns, time_ns))
     delay_s = np.zeros(len(time_s))
     for _ in range(LIGHT_ITERATIONS):
@@ -107,7 +108,6 @@ def _by_positions(positions: pl.DataFrame, time_ns: Integers, sensor_km: Array) 
         after = np.searchsorted(solved_s, at_s)
         inside = (after > 0) & (after < len(solved_s))
         after = np.where(inside, after, 1)
-        known = positions.select(POSITION).to_numpy()
         r_km = np.column_stack([np.interp(at_s, solved_s, axis) for axis in known.T])
         step_s = np.diff(solved_s, append=np.inf)[after - 1]
         r_km[~(inside & (step_s <= MAX_APART_S))] = np.nan

@@ -9,17 +9,19 @@ from epipole.schemas.arrays import Array, Indices
 
 PAIR_BINS = np.linspace(0.0, 5.0, 26)  # edges, in sigmas
 MIN_BINS, MAX_BINS = 8, 40
-FEW = 60  # values: fewer make no bars that one could compare with a line
+FEW = 60  # fewer values make no bars that one could compare with a line
 
 
 class Chi2(NamedTuple):
     """Chi-squares of one kind.
 
-    edges, counts : histogram; (n + 1,) and (n,). The last bin also has what lies beyond it
-    freedom : (m,) how many have this many degrees of freedom, by the number
+    edges, counts : (n + 1,) and (n,), histogram of the chi-squares; of pairs, that of the roots.
+        The last bin also has what lies beyond it
+    freedom : (m,), ``freedom[k]`` have k degrees of freedom
     total, freedoms : sums of the chi-squares and of the degrees of freedom
     independent : how many share no detection with each other
-    few : the values themselves, in order, where they are fewer than `FEW`; else empty
+    few : the chi-squares themselves, in order, where they are fewer than `FEW`; else, and of pairs,
+        empty
     """
 
     edges: Array
@@ -61,9 +63,8 @@ def _pairs(night: NightReader) -> Chi2 | None:
         z = z[np.isfinite(z)]
         counts += np.histogram(np.minimum(z, PAIR_BINS[-1]), PAIR_BINS)[0]
         total, number = total + float(z @ z), number + len(z)
-    freedom = np.array([0, number])
-    none = np.empty(0)
-    return Chi2(PAIR_BINS, counts, freedom, total, number, number, none) if number else None
+    freedom, few = np.array([0, number]), np.empty(0)
+    return Chi2(PAIR_BINS, counts, freedom, total, number, number, few) if number else None
 
 
 def _positions(night: NightReader) -> Chi2 | None:

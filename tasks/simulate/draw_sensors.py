@@ -64,7 +64,7 @@ def true_optics(camera: SceneCamera) -> TrueOptics:
 # Sensors.
 
 
-_DRAWS = 10_000  # of a random orbit from which the tracked object is visible
+_DRAWS = 10_000  # maximum number, to find a random orbit from which the tracked object is visible
 
 
 class DrawnSensor(NamedTuple):
@@ -73,7 +73,7 @@ class DrawnSensor(NamedTuple):
     sensor: SimulatedSensor
     group: SceneSensor
     element_set: ElementSet | None
-    satellite: str  # its name, by which sensors on one satellite are known
+    satellite: str  # its name, the same for all sensors on it
 
 
 def draw_sensors(scene: Scene, t0_ns: int, objects: DrawnObjects) -> list[DrawnSensor]:
@@ -124,7 +124,11 @@ def _on_constellation(
 def _on_satellites(
     scene: Scene, group: SceneSensor, t0_ns: int, objects: DrawnObjects, first: int
 ) -> Iterator[DrawnSensor]:
-    """Yield the sensors of a group, each on another satellite."""
+    """Yield the sensors of a group, each on another satellite of a list of element sets.
+
+    Where the tracked object has to be visible (`in_view`), satellites from which it is not are
+    passed over.
+    """
     satellites = propagate_satellites(scene, group.orbit, t0_ns)
     order = np.arange(len(satellites.sets))
     if group.count is not None and group.count < len(order):
@@ -156,6 +160,7 @@ def _too_few(scene: Scene, group: SceneSensor, satellites: Satellites, found: in
 
 
 def _phase(group: SceneSensor, rng: np.random.Generator) -> float:
+    """Return when in the frame interval frames are taken, as a share of it: given, or random."""
     return float(rng.random()) if group.phase is None else group.phase
 
 
@@ -302,7 +307,7 @@ def _offset(
     streams: Callable[[str], np.random.Generator],
     purpose: str,
 ) -> Array:
-    """Return an offset (3,): as given, or of a given size in a random direction."""
+    """Return an offset (3,): as given, or of the given length in a random direction."""
     if isinstance(offset, tuple):
         return np.array(offset, float)
     direction = streams(purpose).standard_normal(3)

@@ -29,7 +29,7 @@ class Waiting(NamedTuple):
 
 
 class Late(NamedTuple):
-    """The first `n` messages of a channel, in the log of this number within the file."""
+    """The first `n` messages of a channel, in the log number `log` of the file, counted from 0."""
 
     log: int
     number: int
@@ -39,7 +39,7 @@ class Late(NamedTuple):
 
 @dataclass
 class Undeclared:
-    """Messages of a file without a declaration before them."""
+    """Counts the messages of a file without a declaration before them, in the first walk."""
 
     _waiting: dict[int, Waiting] = field(default_factory=dict)  # by channel, in the latest log
     _late: list[Late] = field(default_factory=list)
@@ -54,7 +54,7 @@ class Undeclared:
         """Look at the channels at the end of a log; yield the messages that are to be left out."""
         for number, waiting in sorted(self._waiting.items()):
             reason, channel = channels.missing(number), channels.find(number)
-            # As many as channels in one log: a file may be made of a million logs.
+            # At most as many as one log can have: a file may be made of a million logs.
             if channel is not None and len(self._late) == N_CHANNELS:
                 reason = Reason.UNKNOWN_CHANNEL
             if reason is not None:
@@ -85,17 +85,20 @@ class LateMessages:
         return self._left > 0
 
     def begin_log(self, log: int) -> None:
-        """Begin with the log of a number within the file."""
+        """Begin with log number `log` of the file, counted from 0."""
         self._n[list(self.channels)] = 0
         self.channels = {item.number: item.channel for item in self._of_log.get(log, [])}
         for item in self._of_log.get(log, []):
             self._n[item.number] = item.n
 
     def take(self, channel: Channels) -> Integers:
-        """Return which of these messages, the next ones in the file, were not read before."""
+        """Return which of the next messages of the file were not read before, in order.
+
+        `channel` (n,) are their channels; returned are rows of it.
+        """
         order = np.argsort(channel, kind="stable")
         in_order = channel[order]
-        # How many messages of the same channel come before each one.
+        # For each message, how many of the same channel come before it.
         rank = np.arange(len(order)) - np.searchsorted(in_order, in_order)
         taken = np.sort(order[rank < self._n[in_order]])
         counts = np.bincount(channel[taken])

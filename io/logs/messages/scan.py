@@ -22,12 +22,15 @@ from epipole.schemas import log_bounds as bounds
 from epipole.schemas.arrays import Array, Flags, Integers
 
 MAX_NAMES = 1024  # sensors that a scan can distinguish; decoding has no limit
-NAME_BYTES = 63
+NAME_BYTES = 63  # maximum length of a name, as of a sensor id
 NAN_BITS, NO_SIGN = np.int32(0x7FC00000), np.int32(0x7FFFFFFF)  # of a float32
 
 
 def _bits(value: float) -> np.int32:
-    """Return the bits of a float32; of positive ones they are in the order of the values."""
+    """Return the bits of a float32 as an integer.
+
+    Those of positive numbers are in the order of the values; infinity and NaN follow.
+    """
     return np.float32(value).view(np.int32)
 
 
@@ -47,7 +50,9 @@ MAX_SIGMA_KM = bounds.POSITION_SIGMA.maximum
 VAGUE_ARCSEC, ANY_ARCSEC = bounds.ATTITUDE_SIGMA.maximum, float(bounds.ARCSEC_OF_HALF_A_TURN)
 
 
-# Columns of `fields`: where a field of a CentroidFrame begins, and of a SensorState.
+# Columns of `fields`, the first of two for each field of a CentroidFrame and of a SensorState (see
+# `messages.encoding`): the value, or the offset [bytes] of a text or array. The second one has the
+# length of that.
 LOCATED = 0
 TIME, ID, NUMBER, EXPOSURE, X, Y, FLUX, SIGMA = range(2, 18, 2)
 REFERENCE, POSITION, VELOCITY, POSITION_SIGMA, ATTITUDE, ATTITUDE_SIGMA = range(6, 18, 2)
@@ -106,7 +111,10 @@ class StateRows(NamedTuple):
 
 @kernel
 def _valid_id(data, at, n):
-    """Return whether a text is a valid sensor id."""
+    """Return whether the n bytes of `data` from `at` on are a valid sensor id.
+
+    As `log_messages.SENSOR_ID_PATTERN` says.
+    """
     if n < 1 or n > NAME_BYTES:
         return False
     for k in range(n):
@@ -139,7 +147,11 @@ def _find(data, at, n, names):
 
 @kernel
 def _sensor(data, at, n, names, channel):
-    """Return the code of a sensor id, new or known; -1 where it is invalid or there is no room."""
+    """Return the code of a sensor id, new or known; -1 where it is invalid or there is no room.
+
+    The id is n bytes of `data` from `at` on. `names` are changed; `channel` is the number of that
+    of the message: its last sensor is tried first.
+    """
     code = names.hint[channel]
     if code < names.n[0] and _same(data, at, n, names, code):
         return code
@@ -159,7 +171,10 @@ def _sensor(data, at, n, names, channel):
 
 @kernel
 def _copy_positions(data, at, bits, low, n):
-    """Copy the bits of `n` float32 from byte `at` on; return whether all are within bounds."""
+    """Copy the bits of `n` float32 from byte `at` on to `bits` from `low` on.
+
+    Return whether all are within bounds, of either sign.
+    """
     to, bad = np.uint64(low), np.int32(0)  # unsigned: numba need not check for negative indices
     for k in range(n):
         value = load_int32(data, at + 4 * k)
@@ -170,9 +185,10 @@ def _copy_positions(data, at, bits, low, n):
 
 @kernel
 def _copy_positive(data, at, n_sent, limits, bits, low, n):
-    """Copy the bits of float32, NaN where a value is out of bounds or was not sent.
+    """Copy as `_copy_positions` does; NaN where a value is out of bounds.
 
-    Return whether all values that were sent are within the bounds, which are positive.
+    Return whether all are within bounds. `limits` are the bits of both bounds, which are positive.
+    If nothing was sent (`n_sent` is 0), n values are NaN.
     """
     to, bad = np.uint64(low), np.int32(0)
     if not n_sent:
@@ -192,7 +208,8 @@ def _copy_positive(data, at, n_sent, limits, bits, low, n):
 def scan_frames(messages, i, names, rows, n):
     """Copy good frames from message `i` on to rows from `n` on; return both where it stops.
 
-    The rows must have room for all messages, and for an eighth of their bytes in centroids.
+    `messages` and `rows` are `Messages` and `FrameRows`; `names` are changed. The rows must have
+    room for all messages, and for an eighth of their bytes in centroids.
     """
     # Each array is taken out of its tuple once: this counts references, which takes time.
     data, channel, fields = messages
@@ -247,7 +264,8 @@ def _copy_doubles(data, at, n_sent, row):
 def scan_states(messages, i, names, frames, rows, n):
     """Copy good states from message `i` on to rows from `n` on; return both where it stops.
 
-    `frames` are the known reference frames.
+    `messages` and `rows` are `Messages` and `StateRows`; `names`, of the sensors, are changed.
+    `frames` are the names of the known reference frames.
     """
     data, channel, fields = messages
     while i < len(fields) and fields[i, LOCATED]:
@@ -314,7 +332,7 @@ class NameCodes:
         return code
 
     def _enter(self, code: int, text: bytes) -> None:
-        """Add a name to the table of the scans, if there is room; they stop at a name without."""
+        """Add a name to the table of the scans, if there is room; scans stop at any other name."""
         if code >= MAX_NAMES or len(text) > NAME_BYTES:
             return
         self.table.text[code, : len(text)] = np.frombuffer(text, np.uint8)

@@ -30,8 +30,8 @@ class Samples(NamedTuple):
     time_s : (k,) float
         The instants [s].
     sensor_km : (s, k, 3) float
-        Positions of the sensors, GCRF; NaN where unknown. They must be known
-        at the instants at which a tracklet of the sensor is seen.
+        Positions of the sensors [km], GCRF; NaN where unknown. They must be known at the instants
+        at which a tracklet of the sensor is seen.
     R_sensor_from_icrs : (s, k, 3, 3) float
         Attitudes of the sensors; NaN where unknown.
     half_field : (s, 2) float
@@ -39,12 +39,12 @@ class Samples(NamedTuple):
     rate : (t, k, 3) float or None
         Rates of the directions [rad/s], ICRS; 0 where unknown.
     sensor_km_s : (s, k, 3) float or None
-        Velocities of the sensors, GCRF; NaN where unknown. Without them, or without the rates,
-        light time is ignored. This is right for sensors at similar ranges.
+        Velocities of the sensors [km/s], GCRF; NaN where unknown. Without them, or without the
+        rates, light time is ignored. This is right for sensors at similar ranges.
     magnitude : (t,) float or None
         Mean apparent magnitudes; NaN where unknown.
     blend_rad : (s,) float or None
-        Angle between two objects below which a sensor sees them as one; None: always apart.
+        Angle between two objects below which a sensor sees them as one [rad]; None: always apart.
     """
 
     sensor: Indices
@@ -65,7 +65,7 @@ class Samples(NamedTuple):
 
     @property
     def field_sr(self) -> Array:
-        """Solid angle of each sensor's field, (s,)."""
+        """Solid angle of each sensor's field [sr], (s,)."""
         x, y = self.half_field.T
         return 4 * np.arcsin(np.clip(x * y / np.sqrt((1 + x * x) * (1 + y * y)), 0, 1))
 
@@ -74,7 +74,7 @@ class Groups(NamedTuple):
     """Which tracklets are one object.
 
     group : (t,) int
-        Group of each tracklet; -1 for no group.
+        Group of each tracklet; `FREE` for no group.
     score : (g,) float
         Log-odds of each group against its members being unrelated.
     ambiguous : (t,) bool
@@ -84,8 +84,7 @@ class Groups(NamedTuple):
         Other tracklets in no group that fit one object with a tracklet of another sensor, but with
         too little evidence.
     detected : (s,) float
-        Estimated probability that a sensor detects an object in its field; NaN if not
-        estimated.
+        Estimated probability that a sensor detects an object in its field; NaN if not estimated.
     """
 
     group: Indices
@@ -99,9 +98,9 @@ class InstantPoints(NamedTuple):
     """One point for each of k instants, solved where at least two tracklets have a direction.
 
     x_km : (k, 3) float
-        Positions, GCRF.
+        Positions [km], GCRF.
     normal, cov_km2 : (k, 3, 3) float
-        Normal equations (the upper half is filled) and their inverse, the covariance.
+        Normal equations [1/km^2] (the upper half is filled) and their inverse, the covariance.
     seen_by : (k,) int
         Number of tracklets with a direction at the instant. Below 2 the point is undefined.
     """

@@ -86,9 +86,9 @@ def copy_matrix(source, target):
 
 @borrowing_kernel
 def turn(R, x, y, z):
-    """Turn R (3, 3), sensor from ICRS, in place by the rotation vector (x, y, z) (compiled).
+    """Turn R (3, 3), sensor from ICRS, in place by the rotation vector (x, y, z) [rad] (compiled).
 
-    [rad], about the sensor axes of R.
+    The vector is on the sensor axes of R.
     """
     angle = np.sqrt(x * x + y * y + z * z)
     if angle == 0.0:
@@ -98,7 +98,7 @@ def turn(R, x, y, z):
     qx, qy, qz, qw = f * x, f * y, f * z, np.cos(half)
     for j in range(3):
         a, b, c = R[0, j], R[1, j], R[2, j]
-        # v + 2 q x (q x v + w v)
+        # Column j of R, (a, b, c), becomes v + 2 q x (q x v + w v).
         tx, ty, tz = (
             qy * c - qz * b + qw * a,
             qz * a - qx * c + qw * b,
@@ -179,7 +179,7 @@ def refine_attitude_in(R, u, sigma, a, star_of, P, A):
         py = P[1, 0] * b0 + P[1, 1] * b1 + P[1, 2] * b2
         pz = P[2, 0] * b0 + P[2, 1] * b1 + P[2, 2] * b2
         turn(R, px, py, pz)
-        if px * px + py * py + pz * pz < 1e-20:
+        if px * px + py * py + pz * pz < 1e-20:  # a step below 1e-10 rad
             break
     orthonormalise(R)
     return True

@@ -38,17 +38,17 @@ from epipole.tasks.algorithms.log_checks.readings import (
 )
 from epipole.tasks.algorithms.log_checks.velocities import check_velocities
 
-MIN_SCATTER_STATES = 20  # fewer tell no scatter
-SCATTER_RATIO = 5.0  # of the scatter to the stated sigma: no sigma of a sound log is that small
-MAX_OUTLIERS = 0.1  # share: with more the path itself is not known
-SMALLEST_JUMP_KM = 0.1
+MIN_SCATTER_STATES = 20  # minimum length of an arc that shows the scatter
+SCATTER_RATIO = 5.0  # scatter over stated sigma; the ratio of a sound log is smaller
+MAX_OUTLIERS = 0.1  # share of the states; with more, the path itself is unknown
+SMALLEST_JUMP_KM = 0.1  # minimum of a jump, and of what separates two paths
 STEP_SHARE = 0.02  # of the way between two states: a polynomial is as good on the widest arcs
-NO_FALL = 10.0  # misfit of positions that may have another unit
-MIN_JUMP_STATES = 12  # of an arc: fewer do not tell which one is off
-MIN_SECOND_SHARE = 0.2  # of the states, that belong to a second satellite
-MIN_ALTERNATING = 8
-MAX_SECOND = 400  # states that are searched for a second path
-FAR_STEP = 10.0  # times the usual step: not on the same path
+NO_FALL = 10.0  # misfit above which the unit of positions is unknown if no other unit fits
+MIN_JUMP_STATES = 12  # minimum length of an arc that shows which of its states is off
+MIN_SECOND_SHARE = 0.2  # minimum share of states on each of two paths, and of changes between them
+MIN_ALTERNATING = 8  # minimum number of states that show two paths
+MAX_SECOND = 400  # maximum number of states that are searched for a second path
+FAR_STEP = 10.0  # times the usual distance of neighbours: not on the same path
 
 
 class LogStates(NamedTuple):
@@ -56,7 +56,7 @@ class LogStates(NamedTuple):
 
     time_ns : (n,) int
     r_km, v_km_s : (n, 3) float
-        In the stated frame, as if in the stated units; NaN where there is no velocity.
+        In the stated frame, as if in km and km/s; NaN where there is no velocity.
     sigma_km : (n,) float
         Stated 1-sigma error per axis; 0 where unknown.
     earth_fixed : bool
@@ -96,7 +96,10 @@ def check_states(states: LogStates) -> list[Finding]:
 
 
 def _readings(arcs: Sequence[Arc], earth_fixed: bool) -> tuple[float, list[Finding]]:
-    """Return the unit of positions [km], and the findings on unit, frame and velocities."""
+    """Return the unit of positions [km], and the findings on unit, frame and velocities.
+
+    The first reading is the stated one.
+    """
     stated = EARTH_FIXED if earth_fixed else INERTIAL
     readings = [(reading, read_arcs(arcs, reading)) for reading in main_readings(stated)]
     fits = [fit_reading(read, reading) for reading, read in readings]
@@ -191,13 +194,13 @@ def _jumps(arcs: Sequence[Arc]) -> tuple[Finding, list[Arc], float]:
             continue
         step = float(np.median(np.linalg.norm(np.diff(arc.r, axis=0), axis=1)))
         allowed = max(OUTLIER * scatter, OUTLIER * arc.sigma, SMALLEST_JUMP_KM, STEP_SHARE * step)
-        off = np.abs(residual).max(axis=1)
+        off = np.abs(residual).max(axis=1)  # on the worst axis [km]
         good = off <= allowed
         outliers += int((~good).sum())
         total += len(good)
         largest = max(largest, float(off[~good].max(initial=0.0)))
-        few = good.sum() < max(len(good) * (1 - MAX_OUTLIERS), len(good) / 2)
-        kept.append(arc if few else Arc(arc.t_s[good], arc.r[good], arc.v[good], arc.sigma))
+        no_path = good.sum() < len(good) * (1 - MAX_OUTLIERS)
+        kept.append(arc if no_path else Arc(arc.t_s[good], arc.r[good], arc.v[good], arc.sigma))
     scatter_km = float(np.median(scatters))
     found = Finding(SMOOTHNESS, SOUND, outliers, expected=0.0, facts={"states": total})
     if not total:
@@ -249,20 +252,22 @@ def _two_paths(states: LogStates) -> Finding:
 def _second_path(r_km: Array) -> Flags:
     """Return which states belong to a second path; none where one path is enough.
 
-    A state far from the last one begins the second path; from there on each belongs to the nearer
-    one. There are two paths only if they alternate: a gap changes over once.
+    The first state that is far from the one before begins the second path. From there on each
+    belongs to the path whose last state is nearer. There are two paths only if they alternate:
+    after a gap in one path, all states are on the second.
     """
     n = len(r_km)
     second = np.zeros(n, bool)
     if n < MIN_ALTERNATING:
         return second
+    # Distance to the nearest of the next three states: one of these is on the same path.
     nearest = np.min([
         np.linalg.norm(r_km[k : n - 3 + k] - r_km[: n - 3], axis=1) for k in (1, 2, 3)
     ], axis=0)  # fmt: skip
     far = FAR_STEP * float(np.median(nearest)) + SMALLEST_JUMP_KM
     if (np.linalg.norm(np.diff(r_km, axis=0), axis=1) <= far).all():
         return second
-    last, other = r_km[0], None
+    last, other = r_km[0], None  # last states of the path of the state before, of the other path
     for k in range(1, n):
         to_last = float(np.linalg.norm(r_km[k] - last))
         to_other = np.inf if other is None else float(np.linalg.norm(r_km[k] - other))

@@ -33,7 +33,7 @@ SAME_SATELLITE_KM = 20.0
 # Error of the first solution, as a share of the effect of gravity: the object's height is unknown.
 GRAVITY_SHARE = 0.4
 FASTER = 0.1  # share of that error that is left after each further solution
-J2_SHARE = 0.1  # part of the effect of the oblateness that its mean value lacks
+J2_SHARE = 0.1  # error of the mean effect of the oblateness, as a share of the effect
 FIRST_GATE = 40.0  # chi-square of 2 degrees of freedom, of the first solution
 GATE = 30.0  # and of the last: 3e-7 of true pairs are beyond it
 MAX_RANGE_KM = 100_000.0  # as `association.max_range_km`
@@ -59,6 +59,7 @@ def lagrange(r, v, dt_s):
 
     By universal variables (Battin 1999, section 4.5). r, v (3,) [km, km/s].
     """
+    # alpha: inverse semi-major axis [1/km]; x: universal anomaly; far: distance at the end [km].
     rr = np.sqrt(r[0] * r[0] + r[1] * r[1] + r[2] * r[2])
     v2 = v[0] * v[0] + v[1] * v[1] + v[2] * v[2]
     root = np.sqrt(GM_KM3_S2)
@@ -90,7 +91,7 @@ def dot(a, b):
 # The normal equations of both ranges a and b [km]: the weighted sums of squares and products
 # (aa, ab, bb, a right, b right, right^2).
 NO_EQUATIONS = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
-SINGULAR = 1e-12  # least determinant over the product of the diagonal: beyond it is rounding
+SINGULAR = 1e-12  # minimum determinant over the product of the diagonal: below it is rounding
 
 
 @borrowing_kernel
@@ -137,6 +138,7 @@ def _ranges(tracklets, i, j, arc, a, b, model_km, oblate):
     si, sj, sums = tracklets.r_km[i], tracklets.r_km[j], NO_EQUATIONS
     common = tracklets.position_km[i] ** 2 + tracklets.position_km[j] ** 2 + model_km * model_km
     for side in range(2):
+        # The equation is for the rate of k; `near` and `far` are the ranges of k and of the other.
         k, other, near, far = (i, j, a, b) if side == 0 else (j, i, b, a)
         for c in range(2):
             axis = tracklets.east[k] if c == 0 else tracklets.north[k]
@@ -189,10 +191,10 @@ def join_pair(tracklets, i, j, first_km, state, work):
             for m in range(3):
                 v[m] = (rj[m] - oblate[m] * 0.5 * dt * dt - arc[1] * ri[m]) / arc[2]
         else:
-            _velocity(tracklets, i, j, a, b, v, work[4:7], work[7])
+            _velocity(tracklets, i, j, a, b, v, work[4:7], work[7])  # g is too small to divide by
         f, g, gdot = lagrange(ri, v, dt)
         arc = dt, f, g, gdot
-        # What the next solution lacks: the coefficients are of the ranges of this one.
+        # Error of the next solution: its coefficients are of the ranges of this one.
         model_km = J2_SHARE * 0.5 * _oblateness(ri, rj, oblate) * dt * dt
         if round_ < ROUNDS - 1:
             share = GRAVITY_SHARE * FASTER ** (round_ + 1)
@@ -221,7 +223,7 @@ def _oblateness(ri, rj, out):
 
 @borrowing_kernel
 def _velocity(tracklets, i, j, a, b, v, N, right):
-    """Write the velocity that fits the rates of both directions, for epochs that are the same.
+    """Write the velocity that fits the rates of both directions, for epochs at most a second apart.
 
     v (3,): the velocity [km/s], GCRF; a, b: the ranges [km]. N (3, 3) and right (3,) are scratch.
     """
@@ -250,7 +252,7 @@ def _velocity(tracklets, i, j, a, b, v, N, right):
 
 @borrowing_kernel
 def may_be_one(tracklets, i, j):
-    """Return whether two tracklets may be one object: not if one sensor saw both at a time."""
+    """Return whether two tracklets may be one object: not if one sensor saw both at one time."""
     if tracklets.sensor[i] != tracklets.sensor[j]:
         return True
     return tracklets.first_s[j] > tracklets.last_s[i] or tracklets.first_s[i] > tracklets.last_s[j]
@@ -259,6 +261,8 @@ def may_be_one(tracklets, i, j):
 # Columns of `packed_tracklets`: vectors of three, then numbers.
 _R, _V, _U, _EAST, _NORTH = 0, 3, 6, 9, 12
 _OF_V, _OF_W, _OF_R = 15, 17, 19  # components east and north of v, w and r
+# Mean variances per axis, of the rate [rad^2/s^2], the direction [rad^2] and the sensor's position
+# [km^2]; largest range of a bound object with that rate [km]; time [s].
 _RATE_VAR, _VAR, _POSITION_VAR, _REACH, _TIME = 21, 22, 23, 24, 25
 _COLUMNS = 26
 
@@ -295,11 +299,11 @@ def _dot_at(a, m, b, n):
 
 @borrowing_kernel
 def first_ranges(p, q, f, g, model_km):
-    """Return the ranges [km] of the first solution of two rows of `packed_tracklets`, chi-square.
+    """Return the ranges [km] of the first solution of two tracklets, and chi-square.
 
-    p (26,), q (26,): the rows; f and g [s]: Lagrange's; model_km: 1-sigma error of these. The
-    equations are those of `_ranges`, without oblateness. All pairs are tested, so both axes share
-    one weight: that of their mean variance.
+    p (26,), q (26,): rows of `packed_tracklets`; f and g [s]: Lagrange's; model_km: 1-sigma error
+    of the equations. These are those of `_ranges`, without oblateness. All pairs are tested, so
+    both axes share one weight: that of their mean variance.
     """
     square = FIRST_RANGE_KM * FIRST_RANGE_KM
     common = p[_POSITION_VAR] + q[_POSITION_VAR] + model_km * model_km
@@ -320,7 +324,8 @@ def first_ranges(p, q, f, g, model_km):
 def _first_chi2(p, q, dt, f, g):
     """Return chi-square of the first solution of `join_pair`; inf where a range is not positive.
 
-    p (26,), q (26,): rows of `packed_tracklets`; dt [s]: the time between; f and g [s]: Lagrange's.
+    p (26,), q (26,): rows of `packed_tracklets`; dt [s]: the time between; f and g [s]: Lagrange's,
+    of a circular orbit.
     """
     fall = GRAVITY_SHARE * 0.5 * GM_KM3_S2 / _dot_at(p, _R, p, _R) * dt * dt
     a, b, chi2 = first_ranges(p, q, f, g, fall)
@@ -375,6 +380,7 @@ def search(tracklets, packed, group, max_gap_s, first, last, pairs, states, stat
             if _too_far(p, q, dt) or (group[i] >= 0 and group[i] == group[j]):
                 continue
             f, g = np.cos(n * dt), np.sin(n * dt) / n
+            # Start 0 is a circular orbit at the sensor's height, 1 and on those at other ranges.
             start = 0 if _first_chi2(p, q, dt, f, g) < FIRST_GATE else 1
             end = 1 + (len(OTHER_RANGES_KM) if _on_one_satellite(p, q, dt, f, g) else 0)
             if start == end or not may_be_one(tracklets, i, j):

@@ -20,11 +20,11 @@ GEOSTATIONARY_KM = (GM_KM3_S2 / EARTH_RATE_RAD_S**2) ** (1 / 3)
 # IADC Space Debris Mitigation Guidelines (2007), section 3.3.2: the geosynchronous region.
 REGION_KM = 200.0
 REGION_RAD = np.radians(15.0)
-SIGMAS = 3.0  # by which a semi-major axis may be off
+SIGMAS = 3.0  # by which a semi-major axis may be outside the region
 SIDEREAL_DAY_S = TURN / EARTH_RATE_RAD_S
 
 
-IN_DEGREES = np.array([1.0, 1.0, *np.degrees(np.ones(4))])  # turns the angles of elements
+IN_DEGREES = np.array([1.0, 1.0, *np.degrees(np.ones(4))])  # elements times this: angles in degrees
 
 
 def elements_of(state: Array) -> Array:
@@ -83,7 +83,7 @@ def element_errors(state: Array, cov: Array) -> Array:
     Notes
     -----
     They are of the linear model. The perigee of a nearly circular orbit, and the node of one that
-    is nearly in the equator, have sigmas that are as large as the circle or larger.
+    is nearly in the equator, may have sigmas of a full turn or more.
     """
     lengths = [np.linalg.norm(part, axis=1) for part in (state[:, :3], state[:, 3:])]
     step = DERIVATIVE_STEP * np.repeat(np.stack(lengths, axis=1), 3, axis=1)
@@ -148,7 +148,7 @@ def geostationary(
 
 
 def _longitude(unknowns: Array, time_s: float, around: Surroundings) -> tuple[float, Array]:
-    """Return the longitude of an orbit [rad], in (-pi, pi], and its derivatives."""
+    """Return the longitude of an orbit [rad], in [-pi, pi), and its derivatives by the unknowns."""
     x, y = unknowns[:2]
     angle = np.arctan2(y, x) - around.era_rad - EARTH_RATE_RAD_S * time_s
     slope = np.zeros_like(unknowns)

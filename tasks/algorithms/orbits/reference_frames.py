@@ -21,7 +21,8 @@ from epipole.tasks.algorithms.times import tai_minus_utc_s, tt_julian_date, utc_
 EME2000_FROM_GCRF: Array = erfa.bp06(2451545.0, 0.0)[0]  # rotation matrix: the frame bias
 FRAMES = ("GCRF", "EME2000", "TEME", "ITRF")
 MJD_JD = 2400000.5
-# The fastest term of nutation takes days: linear over ten minutes to 1e-6 arcsec.
+# Time from node to node [ns]. The fastest term of nutation takes days: linear over ten minutes to
+# 1e-6 arcsec.
 NODE_NS = 600_000_000_000
 
 
@@ -152,7 +153,9 @@ MESSAGE_FRAMES = ("GCRF", "EME2000", "ITRF")
 
 
 def from_gcrf(frame: str, time_ns: Nanoseconds, orientation: Orientation) -> Array:
-    """Return (n, 6, 6): what turns states (km, km/s) of GCRF to a frame, and their covariances.
+    """Return (n, 6, 6) matrices that turn states [km, km/s] from GCRF to a frame.
+
+    Covariances too: multiply by the matrix and by its transpose.
 
     Parameters
     ----------
@@ -183,7 +186,10 @@ def _tirs_from_gcrf(time_ns: Nanoseconds, orientation: Orientation) -> Array:
 
 
 def _cirs_from_gcrf(time_ns: Nanoseconds) -> Array:
-    """Return (n, 3, 3), CIRS from GCRF. The long series is evaluated at nodes only."""
+    """Return (n, 3, 3), CIRS from GCRF: precession and nutation.
+
+    The long series is evaluated at nodes only, and interpolated.
+    """
     index = time_ns // NODE_NS
     nodes = np.unique(np.concatenate([index, index + 1]))
     at_nodes = np.stack(erfa.xys06a(*tt_julian_date(nodes * NODE_NS)), axis=-1)

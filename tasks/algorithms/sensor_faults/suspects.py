@@ -36,8 +36,8 @@ from epipole.tasks.algorithms.sensor_faults.fault_judgement import (
 
 MAX_TOGETHER = 24  # maximum number of sensors that are judged together
 MAX_ROUNDS = 4  # each round judges the next suspects, without the sensors already at fault
-MIN_JOINED_SHARE = 0.3  # minimum share of them that a sound sensor joins
-MIN_UNASSIGNED = 0.5  # minimum of unassigned tracklets per object in the field, if at fault
+MIN_JOINED_SHARE = 0.3  # minimum share of the objects in its field that a sound sensor joins
+MIN_UNASSIGNED = 0.5  # minimum of unassigned tracklets per object in the field of a faulty sensor
 
 
 def judge_many_sensors(
@@ -85,7 +85,7 @@ def judge_many_sensors(
 def _doubt_of_most(
     lines: Lines, position_sigma_km: Array, attitude_sigma_rad: Array, guess_s: Array
 ) -> Doubt:
-    """Return what is wrong without a name, by the sensors with most lines alone."""
+    """Return the faults without a sensor that the `MAX_TOGETHER` sensors with most lines show."""
     count = np.bincount(lines.sensor, minlength=len(position_sigma_km))
     most = np.sort(np.argsort(-count, kind="stable")[:MAX_TOGETHER])
     others = np.ones(len(count), bool)
@@ -98,20 +98,24 @@ def _doubt_of_most(
 
 
 class _Equations(NamedTuple):
-    """Normal equations (s, 7, 7) and right sides (s, 7) of each sensor alone."""
+    """Normal equations (s, 7, 7) and right sides (s, 7) of each sensor alone.
+
+    The unknowns are those of `PER_SENSOR`, each over its prior sigma.
+    """
 
     normal: Array
     right: Array
 
 
 def _nothing_known(n: int) -> JudgedSensors:
+    """Return n sound sensors without offsets."""
     return JudgedSensors(
         np.full(n, np.nan), np.full(n, np.nan), [SOUND] * n, np.zeros(n), np.zeros(n)
     )
 
 
 def _of_other_sensors(lines: Lines, faulty: Flags) -> Lines:
-    """Return the lines of the other sensors."""
+    """Return the lines of the sensors that are not `faulty` (s,)."""
     kept = ~faulty[lines.sensor]
     return lines._replace(**{name: getattr(lines, name)[kept] for name in Lines._fields})
 
@@ -119,6 +123,7 @@ def _of_other_sensors(lines: Lines, faulty: Flags) -> Lines:
 def _with_biases_as_noise(lines: Lines, prior_sigma: Array) -> Lines:
     """Return the lines with the biases of their sensors as a part of their errors."""
     of_sensor = prior_sigma.reshape(-1, PER_SENSOR)[lines.sensor]
+    # Columns 1 and 4: sigma of the position [km] and of the attitude [rad], the same on each axis.
     reach = np.linalg.norm(lines.x_km - lines.r_km, axis=1)
     variance = (of_sensor[:, 1] / reach) ** 2 + of_sensor[:, 4] ** 2
     cov = lines.cov + variance[:, None, None] * np.eye(2)
@@ -126,10 +131,10 @@ def _with_biases_as_noise(lines: Lines, prior_sigma: Array) -> Lines:
 
 
 def _with_sound_others(lines: Lines, together: Indices, prior_sigma: Array) -> Lines:
-    """Return the lines, with all sensors but these assumed sound."""
+    """Return the lines, with all sensors but these assumed sound: `sensor` counts in `together`."""
     number = np.full(lines.sensor.max(initial=-1) + 1, -1)
-    inside = together[together < len(number)]
-    number[inside] = np.arange(len(together))[together < len(number)]
+    inside = together < len(number)  # sensors beyond have no lines
+    number[together[inside]] = np.arange(len(together))[inside]
     sensor = number[lines.sensor]
     cov = np.where(
         (sensor >= 0)[:, None, None], lines.cov, _with_biases_as_noise(lines, prior_sigma).cov

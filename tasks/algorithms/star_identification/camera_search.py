@@ -36,8 +36,8 @@ from epipole.tasks.algorithms.star_identification.sensor_model import Skies
 from epipole.tasks.algorithms.star_identification.star_grid import Sky, SkyGrid
 from epipole.tasks.algorithms.star_identification.star_pairs import PairTable
 
-STEP = 0.01  # of the logarithm of the focal length
-BLOCK = 0.2  # of the logarithm: trials of a block share a sky, whose depth and pairs hardly change
+STEP = 0.01  # of the natural logarithm of the focal length, from trial to trial
+BLOCK = 0.2  # of the same: trials of a block share a sky, whose depth and pairs hardly change
 BRIGHTEST = 40  # centroids of a frame that take part
 MIN_CENTROIDS = 6  # of a frame that is tried; also the minimum of matched stars
 UNKNOWN_SIGMA_PX = 0.5  # error of centroids whose log states none
@@ -45,14 +45,15 @@ UNKNOWN_SIGMA_PX = 0.5  # error of centroids whose log states none
 DISTORTIONS = (0.04, -0.04, 0.08, -0.08, 0.12, -0.12)
 ENOUGH_MATCHED = 0.8  # share of the centroids; with more matched, no distortion is tried
 MORE_STARS = 1.5  # stars matched by a better camera over those identified with the nominal one
-DISTORTED_REACH = 0.08  # of the logarithm of the focal length, in trials with distortion
+DISTORTED_REACH = 0.08  # largest change of the logarithm in trials with distortion
+STARS_PER_CENTROID = 1.2  # as a first guess, see `sensor`
 TRIAL_TIME_LIMIT_S = 0.1  # of one trial, as `MatchSettings.time_limit_s`
 # What the search may cost in a first frame, whatever the budget (CPU time by counted work). Cameras
 # that are found cost at most 0.5 s; all trials of a frame of 40 points without stars cost 8 s, of
 # one with centroid errors of 50 px a minute.
 FIRST_FRAME_S = 5.0
 STEPS_AROUND = 8  # on both sides of the focal length of a trial that matches stars
-MAX_REFINEMENTS = 4  # with a better focal length, more stars match
+MAX_REFINEMENTS = 4  # of a focal length: with a better one, more stars match, which improve it
 
 
 class ImageFrame(NamedTuple):
@@ -94,8 +95,11 @@ class _BlockSky(NamedTuple):
 
 @dataclass
 class _Trials:
-    """What all trials share: a source of skies for the angle of a pixel [rad], settings, and what
-    the searches may cost and have cost so far (CPU time by counted work)."""
+    """What all trials share.
+
+    skies_of : the skies for a pixel of this angle [rad]
+    limit_s, cost_s : what the searches may cost, and have cost (CPU time by counted work)
+    """
 
     skies_of: Callable[[float], Skies]
     matching: MatchSettings
@@ -150,8 +154,9 @@ def find_cameras(
         No further frame is searched once the searches have cost this (CPU time by counted work).
         The first one is always searched, until it has cost this and `FIRST_FRAME_S`.
     """
-    reach = float(np.log(reach))
-    n_trials = 2 * (_n_trials(reach) + len(DISTORTIONS) * _n_trials(min(reach, DISTORTED_REACH)))
+    log_reach = float(np.log(reach))
+    n_distorted = len(DISTORTIONS) * _n_trials(min(log_reach, DISTORTED_REACH))
+    n_trials = 2 * (_n_trials(log_reach) + n_distorted)  # rows count down and up
     matching = matching._replace(
         threshold=matching.threshold + np.log(n_trials * max(len(frames), 1)),
         time_limit_s=TRIAL_TIME_LIMIT_S,
@@ -164,35 +169,41 @@ def find_cameras(
             continue
         if trials.cost_s > budget_s:
             return
-        found = _best_match(kept, nominal, reach, trials)
+        found = _best_match(kept, nominal, log_reach, trials)
         if found is not None and found.n_stars >= MORE_STARS * frame.n_stars:
             yield FoundCamera(found.camera, found.n_stars, k)
 
 
-def _best_match(frame: ImageFrame, nominal: Camera, reach: float, trials: _Trials) -> _Match | None:
-    """Return the camera that matches most stars; of equal ones the one with least changes."""
+def _best_match(
+    frame: ImageFrame, nominal: Camera, log_reach: float, trials: _Trials
+) -> _Match | None:
+    """Return the camera that matches most stars; of equal ones the one with least changes.
+
+    `log_reach` is the largest change of the logarithm of the focal length.
+    """
     found, sides = [], [nominal, mirrored(nominal)]
-    plain = _first_match(frame, sides, reach, trials)
+    plain = _first_match(frame, sides, log_reach, trials)
     if plain is not None:
         found, sides = [plain, _with_fitted_k1(frame, plain, trials.matching)], [plain.camera]
         if any(match.n_stars > ENOUGH_MATCHED * len(frame.x_px) for match in found):
             return max(found, key=_n_stars)
     for share in DISTORTIONS:
         distorted = [_distorted(side, share) for side in sides]
-        match = _first_match(frame, distorted, min(reach, DISTORTED_REACH), trials)
+        match = _first_match(frame, distorted, min(log_reach, DISTORTED_REACH), trials)
         if match is not None:
             found.append(_with_fitted_k1(frame, match, trials.matching))
     return max(found, key=_n_stars, default=None)
 
 
 def _first_match(
-    frame: ImageFrame, sides: Sequence[Camera], reach: float, trials: _Trials
+    frame: ImageFrame, sides: Sequence[Camera], log_reach: float, trials: _Trials
 ) -> _Match | None:
-    """Return the camera with the first focal length that matches stars; None at the limit too.
+    """Return the camera with the first focal length that matches stars.
 
-    `sides` are the nominal camera with rows that count down and up.
+    None if none does, or if the trials have cost too much before. `sides` are the camera with rows
+    that count down and up, or the one of these that is known.
     """
-    for block in _blocks(reach):
+    for block in _blocks(log_reach):
         if trials.is_spent():
             return None
         ratios = list(block)
@@ -208,7 +219,7 @@ def _first_match(
 
 
 def _with_fitted_k1(frame: ImageFrame, match: _Match, matching: MatchSettings) -> _Match:
-    """Return the match with k1 and focal length fitted to its stars, if it has no fewer then."""
+    """Return the match with k1 and focal length fitted to its stars; the same if stars are lost."""
     best = match
     for _ in range(MAX_REFINEMENTS):
         seen = match.solution.star >= 0
@@ -226,7 +237,10 @@ def _with_fitted_k1(frame: ImageFrame, match: _Match, matching: MatchSettings) -
 def agreeing_camera(
     frame: ImageFrame, camera: Camera, skies_of: Callable[[float], Skies], matching: MatchSettings
 ) -> FoundCamera | None:
-    """Return the camera that matches this frame within a step of `camera`, None without a match."""
+    """Return the camera that matches this frame, from one trial with `camera`; None if that fails.
+
+    Its focal length may be some steps off.
+    """
     matching = matching._replace(time_limit_s=TRIAL_TIME_LIMIT_S, crowded=False)
     kept = _brightest(frame)
     if len(kept.x_px) < MIN_CENTROIDS:
@@ -236,17 +250,18 @@ def agreeing_camera(
     return None if found is None else FoundCamera(found.camera, found.n_stars, 0)
 
 
-def _blocks(reach: float) -> Iterator[Iterator[float]]:
-    """Yield the ratios to try, in blocks; the nearest to 1 comes first."""
-    steps = np.arange(-round(reach / STEP), round(reach / STEP) + 1) * STEP
+def _blocks(log_reach: float) -> Iterator[Iterator[float]]:
+    """Yield the factors on the focal length to try, in blocks; the nearest to 1 comes first."""
+    steps = np.arange(-round(log_reach / STEP), round(log_reach / STEP) + 1) * STEP
     block = np.round(steps / BLOCK).astype(int)
     for number in sorted(set(block.tolist()), key=lambda b: (abs(b), b)):
         logs = steps[block == number]
         yield (float(np.exp(s)) for s in logs[np.argsort(np.abs(logs), kind="stable")])
 
 
-def _n_trials(reach: float) -> int:
-    return 2 * round(reach / STEP) + 1
+def _n_trials(log_reach: float) -> int:
+    """Return how many focal lengths `_blocks` yields."""
+    return 2 * round(log_reach / STEP) + 1
 
 
 def _distorted(camera: Camera, share: float) -> Camera:
@@ -270,25 +285,26 @@ def _shared_sky(
     frame: ImageFrame, nominal: Camera, ratios: Sequence[float],
     skies_of: Callable[[float], Skies],
 ) -> _BlockSky:  # fmt: skip
-    """Return the sky, its grid and its pairs for all of these focal lengths."""
+    """Return the sky, its grid and its pairs for the nominal focal length times any of `ratios`."""
     wide, narrow = (field_of_view(_scaled(nominal, end(ratios))) for end in (min, max))
     middle = _scaled(nominal, float(np.median(ratios)))
     skies = skies_of(middle.pixel_rad)
-    limit = skies.limit_for(1.2 * len(frame.x_px) / field_of_view(middle).solid_angle_sr)
+    n_stars = STARS_PER_CENTROID * len(frame.x_px)
+    limit = skies.limit_for(n_stars / field_of_view(middle).solid_angle_sr)
     optics = FieldOfView(wide.half_diagonal_rad, narrow.box, middle.pixel_rad)
     radius = 9.0 * float(np.median(_sigma_px(frame, middle))) * wide.pixel_rad
     return _BlockSky(skies.sky(limit), skies.grid(limit, radius), skies.pairs(limit, optics))
 
 
 def _sigma_px(frame: ImageFrame, camera: Camera) -> Array:
-    """Return the errors of centroids where the focal length is off by up to half a step."""
+    """Return the errors of centroids [px] where the focal length is off by up to half a step."""
     r = np.hypot(frame.x_px - camera.cx_px, frame.y_px - camera.cy_px)
     sigma = np.where(np.isnan(frame.sigma_px), UNKNOWN_SIGMA_PX, frame.sigma_px)
-    return np.hypot(sigma, STEP / np.sqrt(12.0) * r)
+    return np.hypot(sigma, STEP / np.sqrt(12.0) * r)  # sigma of a uniform error of that width
 
 
 def _try(frame: ImageFrame, camera: Camera, shared: _BlockSky, trials: _Trials) -> _Match | None:
-    """Return the camera with a refined focal length, and its match."""
+    """Return the camera with a refined focal length, and its match; None without one."""
     matching = trials.matching
     searched = search_frame(_seen_by(frame, camera), *shared, matching)
     trials.cost_s += searched.cost_s
@@ -326,13 +342,14 @@ def _near(
 
 
 def _seen_by(frame: ImageFrame, camera: Camera) -> FrameCentroids:
+    """Return the frame as directions, if this is the camera."""
     u = unproject(camera, frame.x_px, frame.y_px)
     sigma = _sigma_px(frame, camera) * np.nan_to_num(pixel_angle(camera, u), nan=camera.pixel_rad)
     return FrameCentroids(u, sigma, frame.instrumental_mag, frame.beta, field_of_view(camera))
 
 
 def _focal_length(frame: ImageFrame, camera: Camera, solution: Solution, sky: Sky) -> float:
-    """Return the focal length with which the stars are as far apart as on the sky."""
+    """Return the focal length [px] with which the stars are as far apart as on the sky."""
     seen = solution.star >= 0
     u = unproject(camera, frame.x_px[seen], frame.y_px[seen])
     positions = camera.fx_px * u[:, :2] / u[:, 2:]

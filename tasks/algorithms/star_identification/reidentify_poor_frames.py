@@ -71,16 +71,18 @@ def of_other_brightness(
 # Poor frames.
 
 # A frame is poor if its share of stars among its centroids is below this part of the typical one.
-# Measured (bench_unlike_frames): with 0.3, frames that shook keep the errors of the others; with
-# 1.2, more than half of the frames are poor, and one in sixty is identified wrong.
+# Measured (bench_unlike_frames): with 0.3, frames in which the sensor shook keep the errors of the
+# others; with 1.2, more than half of the frames are poor, and one in sixty is identified wrong.
 POOR = 0.6
 MIN_FRAMES = 5  # minimum number of identified frames, for a typical share
-MORE_STARS = 1.5  # larger errors are true if they match this many times the stars
+MORE_STARS = 1.5  # larger errors are taken if at least this many times the stars match with them
 MIN_GAIN = 3.0  # minimum gain in log evidence of another attitude
 LARGER_ERRORS = (2.0, 4.0, 8.0, 16.0)  # factors on the errors that are tried
-# Rescalings of a frame's errors by its residuals, and the degrees of freedom that these need.
+# Maximum number of rescalings of a frame's errors by its residuals, and the degrees of freedom that
+# each needs.
 RESCALINGS, MIN_DOF = 3, 5
-# After this many searches in a row that gain nothing, poor frames are skipped: 1, 3, 7 ... of them.
+# After more searches in a row than `PATIENCE` that gain nothing, 1, 3, 7 ... poor frames are not
+# searched, at most 2^10 - 1.
 PATIENCE, MAX_BACKOFF_LOG2 = 4, 10
 
 
@@ -105,7 +107,8 @@ def reidentify_poor_frames(
 
     `solutions` are changed. `allowance` is what searches may cost.
     """
-    factors, failures, skipped = np.ones(len(solutions.solved)), 0, 0
+    factors = np.ones(len(solutions.solved))
+    failures, skipped = 0, 0  # searches in a row that gained nothing; frames yet to be skipped
     for k in poor_frames(solutions).tolist():
         frame, known = frames.frame(k), solutions.frame(k)
         assert known is not None
@@ -193,8 +196,8 @@ def _n_stars(solution: Solution) -> int:
 
 # Other centroid errors.
 
-# Maximum number of rounds in which the errors of the frames are learned, and the largest change
-# (ln) of an error at which they end.
+# Maximum number of rounds in which the errors of the frames are learned; they end when no error
+# changes by this in its logarithm.
 QUALITY_ROUNDS, SETTLED = 6, 0.02
 # Frames that failed are tried with the errors of the sensor's worst and best tenth, unless these
 # are within a factor of `MIN_OTHER_ERROR` of the sensor's, and with errors larger by `MUCH_WORSE`.
@@ -245,7 +248,7 @@ def _settle_quality(
         again = identify_again(frames.t_s, scaled, solutions, sky, model.matching)
         lost = np.flatnonzero(solutions.solved & ~again.solved)
         again.enter_all(lost, solutions, lost)
-        # What is kept of these was found with their errors before.
+        # The solutions of these are with the errors of the round before.
         again.cov_rad2[lost] *= ratio2[lost, None, None]
         at = np.isin(frame, lost)
         again.chi2[at] /= ratio2[frame[at]]

@@ -61,18 +61,19 @@ from epipole.tasks.algorithms.star_identification.star_grid import Sky
 Statuses = list[str | None]
 
 MIN_CENTROIDS = 4  # of a frame that takes part in the probe and the sample
-# Frames of the probe; more where frames are crowded: the typical frame has more than `CROWDED`
-# centroids, so most are no stars.
+# Number of frames of the probe; more where frames are crowded: with more than `CROWDED` centroids
+# in the typical frame, most centroids are not stars.
 PROBED, PROBED_CROWDED, CROWDED = 5, 8, 100
-MANY = 40  # centroids of a typical frame, of which most may be satellites
-# Frames that show whether they are; what that may cost of the searches' budget.
-FIRST, FIRST_SHARE = 2, 0.05
+# With more centroids in the typical frame, most of them may be satellites. The first `FIRST` probed
+# frames show it, at this share of the searches' budget.
+MANY, FIRST, FIRST_SHARE = 40, 2, 0.05
 # The number of stars in a crowded field is unknown: the first number is assumed, then a sky that is
 # deeper by the second.
 STARS_IN_CROWD, DEEPER_IN_CROWD_MAG = 25.0, 1.5
 # Frames from which the model is learned; 12 and 48 do as well (docs/methods/passes.md).
 SAMPLED = 24
-# First guess of the stars in a field: per centroid, as the sensor misses some; and without a frame.
+# First guess of the number of stars in a field: per centroid, more than one as the sensor misses
+# some; and where no frame has enough centroids.
 STARS_PER_CENTROID, ASSUMED_IN_VIEW = 1.2, 10.0
 # Centroids may be mostly objects or clutter. So skies with a faintest star that is brighter by this
 # are tried as well, if they still have `MIN_IN_VIEW` stars per field on average.
@@ -85,12 +86,12 @@ CREDIBLE_PX = (0.02, 3.0)
 # Relative error of the learned centroid error above which all frames are matched again. With half
 # or twice of it the same frames are identified, and squared errors over covariance change by 0.03.
 WRONG_GATE = 0.02
-
-
-APART_S = 1e9  # in which frames lie that are identified one by one
-# Shares of the searches' budget: of all what the probe may cost, and how many times as much of that
-# a thorough attempt as a quick one; of what is left the pass over all frames, and any other pass.
-PROBE_SHARE, THOROUGH, ALL_SHARE, SHARE = 0.4, 12.0, 0.7, 0.4
+# Frames that are spread over this time [s] are too far apart to be followed one from another.
+APART_S = 1e9
+# Of the searches' budget, the probe may cost the first share. Of what is left when a pass begins,
+# the pass over all frames may cost the second, any other pass the third.
+PROBE_SHARE, ALL_SHARE, SHARE = 0.4, 0.7, 0.4
+THOROUGH = 12.0  # how many times as much as a quick attempt a thorough one of the probe may cost
 
 
 class IdentifiedSensor(NamedTuple):
@@ -113,8 +114,8 @@ class _Probe(NamedTuple):
     """The probed frames.
 
     rows : (n,) int64, which frames
-    solutions : of these
-    usable : (m,) int64, all frames with enough centroids
+    solutions : one for each of these, None where it is not identified
+    usable : (m,) int64, all frames with enough centroids, probed or not
     """
 
     rows: Indices
@@ -197,8 +198,10 @@ def _probe(
     matching: MatchSettings,
     stated: bool,
 ) -> tuple[FrameSample, SensorModel, _Probe]:
-    """Return the frames, a first model, with which some of the probed ones are identified, and
-    these. Moving groups have given some frames a prior, if they were searched."""
+    """Return the frames, a first model and the probed frames, of which it identifies some or none.
+
+    Where moving groups were searched and are of stars, they have given some frames a prior.
+    """
     centroids = frames.centroids
     usable = np.flatnonzero(centroids.counts >= MIN_CENTROIDS)
     typical = float(np.median(centroids.counts[usable])) if len(usable) else 0.0
@@ -222,7 +225,10 @@ def _probe(
 
 
 def _tried_scales(centroids: RawCentroids, stated: bool) -> tuple[float, ...]:
-    """Return the factors on centroid errors that are tried, the likeliest first."""
+    """Return the scales of centroid errors that are tried, the likeliest first.
+
+    They are factors on stated errors, or pixels where none are stated, as `SensorModel.scale` is.
+    """
     if not stated:
         return UNKNOWN_SCALES_PX
     stated_px = float(np.nanmedian(centroids.sigma_px))
@@ -238,7 +244,10 @@ def _are_stars(frames: FrameSample, skies: Skies, model: SensorModel, scale: flo
 
 
 def _assumed_limit(centroids: RawCentroids, typical: float, crowded: bool, skies: Skies) -> float:
-    """Return the faintest star to search for in frames of which nothing is known."""
+    """Return the magnitude of the faintest star to search for in frames of which nothing is known.
+
+    `typical` is the number of centroids of the typical frame.
+    """
     in_view = STARS_IN_CROWD if crowded else STARS_PER_CENTROID * typical or ASSUMED_IN_VIEW
     return skies.limit_for(in_view / centroids.optics[0].solid_angle_sr)
 
@@ -251,7 +260,6 @@ def _anchored_by_motion(
     groups, of_frame = moving_groups(frames.centroids, frames.t_s, rows)
     if not len(of_frame):
         return frames
-    # Far apart in time: none is followed from another.
     apart_s = np.linspace(0.0, APART_S, len(of_frame))
     parts = FrameSample(
         apart_s, groups, no_priors(len(of_frame)), budget=frames.budget, rows=of_frame
@@ -274,20 +282,25 @@ def aperiodic_rows(n: int, wanted: int) -> Indices:
 def _first_scale(
     probe: FrameSample, skies: Skies, model: SensorModel, scales: tuple[float, ...], crowded: bool
 ) -> tuple[SensorModel, list[Solution | None]]:
-    """Return the model with a centroid error that identifies frames, and the solutions."""
+    """Return the model of the first attempt that identifies frames, with the likeliest scale, and
+    the solutions.
+
+    If none does: the given model with the first scale, and None for each frame.
+    """
     attempts = list(_attempts(probe.centroids, skies, model, scales, crowded))
     matching = model.matching
-    # In a crowd only a thorough search finds stars, unless the brightest are stars: with the first
-    # error, and either depth.
-    in_crowd = [crowded and tried.scale == scales[0] and tried.use_flux for tried in attempts]
     tries = [(tried, False) for tried in attempts]
-    tries += [(tried, True) for tried, also in zip(attempts, in_crowd, strict=True) if also]
+    if crowded:
+        # Unless the brightest centroids are stars, only a thorough search finds stars. It is tried
+        # with the first scale, and with either depth of the sky.
+        tries += [(each, True) for each in attempts if each.scale == scales[0] and each.use_flux]
     # Each further attempt is one more chance of a false alarm.
     threshold = matching.threshold + np.log(max(len(tries) - 1, 1))
     thorough = matching._replace(threshold=threshold)
     quick = _quick(thorough)
     weight = np.where([is_thorough for _, is_thorough in tries], THOROUGH, 1.0)
     of_all = _probe_share(len(probe.t_s))
+    # A share is of what is left of the budget, if the attempts before have spent all of theirs.
     for k, (tried, is_thorough) in enumerate(tries):
         attempt = tried._replace(matching=thorough if is_thorough else quick)
         share = of_all * weight[k] / (weight.sum() - of_all * weight[:k].sum())
@@ -299,12 +312,12 @@ def _first_scale(
 
 
 def _quick(matching: MatchSettings) -> MatchSettings:
-    """Return the settings of a search that is worth a try, and not for crowds."""
+    """Return the settings of a short search, not of crowds."""
     return matching._replace(time_limit_s=matching.time_limit_s / 4, crowded=False)
 
 
 def _probe_share(n_probed: int) -> float:
-    """Return the share of the budget that the probe may cost: of few frames it is nearly all."""
+    """Return the share of the budget that the probe may cost: nearly all of it for few frames."""
     return max(PROBE_SHARE, 1.0 - 0.1 * n_probed)
 
 
@@ -318,7 +331,7 @@ def _attempts(
     """Yield models to try, the likeliest first."""
     flux = bool(np.isfinite(probe.instrumental_mag).any())
     area = probe.optics[0].solid_angle_sr
-    for use_flux in [True, False] if flux else [True]:  # it may be unrelated to brightness
+    for use_flux in [True, False] if flux else [True]:  # fluxes may be unrelated to brightness
         tried = model._replace(scale=scales[0], use_flux=use_flux)
         yield tried
         if crowded and model.limit_is_open and use_flux:
@@ -337,8 +350,8 @@ def _likeliest_scale(
     model: SensorModel,
     scales: tuple[float, ...],
 ) -> tuple[SensorModel, list[Solution | None]]:
-    """Return the model with the centroid error that explains solved frames best, and their
-    solutions with it."""
+    """Return the model with the scale that explains the solved frames best, and the solutions with
+    it."""
     best, most, chosen = model, -np.inf, solutions
     for scale in dict.fromkeys((model.scale, *scales)):
         frames = centroids.frames(scale, model.use_flux).each()
@@ -381,7 +394,7 @@ def _learn_around(
 
 
 def _runs_around(n: int, rows: Indices) -> Indices:
-    """Return about `SAMPLED` of n rows in runs around these: they are followed, not searched."""
+    """Return about `SAMPLED` of n rows, in runs around these: runs can be followed."""
     length = min(-(-SAMPLED // len(rows)), n)
     start = np.clip(rows - length // 2, 0, n - length)
     return np.unique(start[:, None] + np.arange(length))
@@ -393,7 +406,7 @@ def _runs_around(n: int, rows: Indices) -> Indices:
 def _identify_again(
     frames: FrameSample, solutions: Solutions, skies: Skies, model: SensorModel
 ) -> tuple[Solutions, Statuses, SensorModel]:
-    """Return the solutions with a model that is learned from those there are, and the model."""
+    """Return the solutions of all frames with a model learned from those so far, and the model."""
     solved = np.flatnonzero(solutions.solved)
     rows = solved[evenly_spaced(len(solved), SAMPLED)]
     sampled = [solutions.frame(i) for i in rows]
@@ -407,7 +420,11 @@ def _identify_again(
 def _with_true_scale(
     frames: FrameSample, solutions: Solutions, status: Statuses, skies: Skies, model: SensorModel
 ) -> tuple[Solutions, Statuses, SensorModel]:
-    """Return the solutions and the model with the centroid error that all residuals show."""
+    """Return the solutions and the model with the centroid error that all residuals show.
+
+    If it differs much from the one so far, all frames are matched again with it. Where that loses
+    a frame, the matches stay, and only their errors are scaled.
+    """
     residuals = scale_of(solutions.star, solutions.chi2, int(solutions.solved.sum()))
     if model.adjusted and abs(residuals.scale - 1) > WRONG_GATE:
         model = model._replace(scale=model.scale * residuals.scale)
@@ -419,7 +436,7 @@ def _with_true_scale(
             residuals = scale_of(solutions.star, solutions.chi2, int(solutions.solved.sum()))
         else:
             solutions = solutions.rescaled(residuals.scale)
-            residuals = residuals._replace(scale=1.0)
+            residuals = residuals._replace(scale=1.0)  # it is applied
     if residuals.dof > 0 and (model.adjusted or is_significant(residuals)):
         model = model._replace(scale=model.scale * residuals.scale)
         solutions = solutions.rescaled(residuals.scale)

@@ -49,10 +49,11 @@ APART = 2  # maximum number of frames between the detections of a pair
 # or pairs 3 frames apart they are 99.2.
 P_FAINT = 0.35
 LOG_FAINT_MISS, LOG_FAINT_HIT = np.log(1.0 - P_FAINT), np.log(P_FAINT / P_DETECTION)
-LOG_FAINT = np.log(0.5)  # its prior odds
+LOG_FAINT = np.log(0.5)  # prior odds that a chain is such an object
 FAINT_APART, FAINT_FRAMES = 4, 24  # as `APART`; frames that a chain reaches back
-MAX_FAINT_MISSES = 8  # in a row; 3 of 100 chains have more
-MAX_FREE = 8.0  # free detections in a frame; with 10, this search would take 10 ms
+MAX_FAINT_MISSES = 8  # in a row; 3 of 100 chains of such objects have more
+MAX_FREE = 8.0  # free detections in a frame, up to which faint objects are searched for: with 10 it
+# would take 10 ms
 N_RATES = 24  # classes of rate for which the maximum evidence is tabulated
 SLOWEST_RAD_S = 1e-6  # upper end of the slowest class of rate [rad/s]
 MAX_PAIRS = 500_000  # limit per frame, even in a short sequence
@@ -122,7 +123,7 @@ class TrackRule(NamedTuple):
 class _Pair(NamedTuple):
     """Detection j of frame f and detection i of the earlier frame g.
 
-    chord2, dt : squared chord between them [rad^2], and time between the frames [s]
+    chord2, dt : squared chord between them [rad^2], and time from g to f [s], positive
     """
 
     f: int
@@ -137,7 +138,7 @@ class _Evidence(NamedTuple):
     """How the pairs of two frames are judged.
 
     density : (depth,) float, free detections per steradian in the newest frame and those before
-    best : (N_RATES, k) float, the most that earlier frames can still add, see `_max_evidence`
+    best : (N_RATES, k) float, log-evidence that earlier frames can add at most, see `_max_evidence`
     log_pairs : ln of the number of pairs, each of which may be a false alarm
     faint : whether objects that are detected in few frames are searched for
     """
@@ -151,7 +152,9 @@ class _Evidence(NamedTuple):
 class _Chains(NamedTuple):
     """The strongest chain of each detection of the newest frame.
 
-    length, strength : (n,) int64 and float, number of detections (0: no chain) and log-evidence
+    length : (n,) int64, number of detections; 0: no chain
+    strength : (n,) float, log-evidence beyond the log of the number of pairs, less what the fluxes
+        take
     members : (n, longest) int64, detections, newest first
     """
 
@@ -294,8 +297,8 @@ def _chain_back(pair, detections, recent, rule, frames, best, wanted, scratch):
     Writes the detections, newest first, to `scratch.members`. The evidence is the log-likelihood
     ratio of one moving object against false alarms, over all detections but the first two; with
     `frames.faint`, of an object that is detected in most frames or in few, whichever is likelier.
-    What the fluxes take ranks chains and leaves the evidence as it is: an object of changing
-    brightness begins a track as soon. `frames` is the `_Evidence` of the pairs of both
+    What the fluxes take is not part of the evidence, it only ranks chains: an object of changing
+    brightness begins a track as soon as another. `frames` is the `_Evidence` of the pairs of both
     frames, `best` its row for the pair's rate. The number is 0 if the evidence can no longer reach
     `wanted`.
     """
@@ -316,6 +319,7 @@ def _chain_back(pair, detections, recent, rule, frames, best, wanted, scratch):
     # Misses beyond the oldest detection count only if an older one follows: the object may have
     # entered the field there.
     misses, taken = 0, 0.0
+    # `bright` and `dim` are the log-evidence of an object that is detected in most frames, in few.
     for k in range(len(best) - 1):
         evidence = max(bright, dim)
         bright_after, dim_after = bright + misses * LOG_MISS, dim + misses * LOG_FAINT_MISS
@@ -339,6 +343,7 @@ def _chain_back(pair, detections, recent, rule, frames, best, wanted, scratch):
             continue
         area = 2 * np.pi * (P[0] + variances[m])
         gain = np.log(P_DETECTION / (frames.density[f - h] * area)) - 0.5 * chi2
+        # A detection that adds less than the misses before it take does not belong to the chain.
         if max(bright_after, dim_after + LOG_FAINT_HIT) + gain < evidence:
             misses += 1
             continue
@@ -357,8 +362,8 @@ def _fastest(best, class_rates, wanted, dt, pairs_sr, rule):
 
     Up to it, chains can reach the evidence `wanted`, and the number of pairs is within the limit.
     `best` (N_RATES, k) is from `_max_evidence`, class_rates (N_RATES + 1,) [rad/s] from
-    `_class_rates`. `dt` [s] is the time between the frames, pairs_sr the number of their pairs per
-    steradian of the disc about a detection in which the other may lie.
+    `_class_rates`. `dt` [s] is the time between the frames. pairs_sr [1/sr], times the solid angle
+    about a detection in which the other may lie, is the number of pairs.
     """
     top = 0.0
     for c in range(N_RATES):
@@ -497,6 +502,7 @@ def _strongest_chains(f, depth, detections, recent, rule):
     """Return the strongest chain of each detection of frame f, as `_Chains`.
 
     Chains are followed over `depth` frames or more, f included, as far as there are frames.
+    `recent` are the `RecentFrames`, f among them.
     """
     n, longest = detections.offsets[f + 1] - detections.offsets[f], len(recent.largest) - 1
     times, field_sr = detections.times, rule.field_sr
@@ -539,8 +545,8 @@ def new_tracks(f, depth, n_tracks, detections, recent, rule):
 
     A chain becomes a track if it has at least `rule.min_detections` detections, and more evidence
     than false alarms in this number of pairs. The strongest come first. Each detection is used
-    once.
-    Writes `detections.track`, numbered from `n_tracks`.
+    once. Writes `detections.track`, numbered from `n_tracks`. `depth` is the minimum of frames over
+    which chains are followed.
 
     Returns
     -------

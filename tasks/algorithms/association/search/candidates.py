@@ -31,8 +31,8 @@ from epipole.tasks.algorithms.association.views import (
 from epipole.tasks.algorithms.kernels import borrowing_kernel, inlined_kernel
 
 # Columns of `WorkSpace.predicted`: coordinates and covariance on the sensor's plane, depth [km],
-# stretch of the plane, the delay of `extra_light_s` [s], and the shift of the coordinates by the
-# motion of the sensor in that time.
+# stretch of the plane (the squared distance of a point on it, over that of its middle), the delay
+# of `extra_light_s` [s], and the shift of the coordinates by the motion of the sensor in that time.
 A0, A1, H00, H01, H11, DEPTH, STRETCH, EXTRA_LIGHT, MOTION0, MOTION1 = range(10)
 
 
@@ -41,10 +41,12 @@ def best_of_sensor(space, work, s, same_sensor, min_gain):
     """Return the free tracklet of sensor s that adds most to the log-odds.
 
     Only grid cells within the gate are searched. A tracklet is weighed once, at the first instant
-    that it shares with the points.
+    that it shares with the points. The points are those of `work`; writes `work.predicted`.
 
     Parameters
     ----------
+    space, work
+        `SearchSpace` and `WorkSpace`.
     same_sensor : (n,) int
         Members of the hypothesis that are of this sensor.
     min_gain : float
@@ -55,7 +57,8 @@ def best_of_sensor(space, work, s, same_sensor, min_gain):
     int
         The tracklet; -1 if no tracklet adds enough.
     float, float
-        Log-odds that it adds, and that the second best adds; `min_gain` if missing.
+        Log-odds that it adds, and that the second best adds; `min_gain` where there is no such
+        tracklet.
     """
     views, chance, taken, gate_sigma = space.views, space.chance, space.taken, space.gate_sigma
     predicted, seen_by = work.predicted, work.points.seen_by
@@ -104,6 +107,7 @@ def _predict(views, s, points, predicted):
         q0, q1, q2 = cam[s, m, PLANE + 3], cam[s, m, PLANE + 4], cam[s, m, PLANE + 5]
         a0 = (p0 * d0 + p1 * d1 + p2 * d2) / depth
         a1 = (q0 * d0 + q1 * d1 + q2 * d2) / depth
+        # From here on, derivatives of the coordinates by the position of the point [1/km].
         p0, p1, p2 = (p0 - a0 * n0) / depth, (p1 - a0 * n1) / depth, (p2 - a0 * n2) / depth
         q0, q1, q2 = (q0 - a1 * n0) / depth, (q1 - a1 * n1) / depth, (q2 - a1 * n2) / depth
         t0 = P[m, 0, 0] * p0 + P[m, 0, 1] * p1 + P[m, 0, 2] * p2
@@ -128,7 +132,9 @@ def _predict(views, s, points, predicted):
 def _gate(views, s, m, predicted, gate_sigma):
     """Return the maximum distance of a tracklet from the prediction, along both coordinates.
 
-    They are those of the plane of sensor s at instant m; `predicted` (k, 10) is of `_predict`.
+    They are those of the plane of sensor s at instant m; `predicted` (k, 10) is of `_predict`. The
+    error of the directions is the largest of the sensor's tracklets, that of its position the one
+    of its first tracklet.
     """
     cam = views.camera
     gate = np.sqrt(quantile(2, gate_sigma))
@@ -150,7 +156,7 @@ def _fit(views, chance, s, c, seen_by, predicted, gate_sigma):
     `seen_by` (k,) is of the points, `predicted` (k, 10) is what `_predict` wrote for sensor s.
     """
     gain, total, n, first_s, see = 0.0, 0.0, 0, 0.0, views.sight
-    largest = quantile(2 * len(views.time_s), gate_sigma)
+    largest = quantile(2 * len(views.time_s), gate_sigma)  # if it is seen at all instants
     for m in range(len(views.time_s)):
         if seen_by[m] < 2 or not views.seen[c, m]:
             continue
@@ -168,7 +174,7 @@ def _fit(views, chance, s, c, seen_by, predicted, gate_sigma):
         det = c00 * c11 - c01 * c01
         chi2 = (e0 * e0 * c11 - 2 * e0 * e1 * c01 + e1 * e1 * c00) / det
         total += chi2
-        if total > largest:  # most candidates end here, before any logarithm
+        if total > largest:  # most candidates end here, before any logarithm is taken
             return -np.inf
         stretch = predicted[m, STRETCH]
         area_sr = 2 * np.pi * np.sqrt(det / (stretch * stretch * stretch))

@@ -22,14 +22,14 @@ from epipole.tasks.algorithms.constants import EARTH_RADIUS_KM
 from epipole.tasks.algorithms.kernels import borrowing_kernel, kernel
 
 FEW_SENSORS = 32  # up to this number of sensors, a single cell holds all of them
-MIN_CELL = 0.05  # size of a cell at the Earth's surface, over the Earth's radius
+MIN_CELL = 0.05  # smallest size of a cell at the Earth's surface, over the Earth's radius
 MAX_CELLS = 400  # mean number per sensor: beyond it, the size of the cells is doubled
 N_SAMPLED = 16  # sensors with which a first size of cells is found
 PIECE_CELLS = 0.5  # length of a step along a cone, in sizes of the cells there
 EDGE_RAD = 1e-3  # added to the half-angle of a cone [rad]
 MAX_HALF_RAD = 1.5  # maximum half-angle of a cone [rad]: its tangent must be finite
-AXIS, TANGENT = 3, 6  # columns of a cone
-OFFSET = 1 << 20  # makes the coordinates of cells positive
+AXIS, TANGENT = 3, 6  # columns of a cone where these begin, see `cones_of`
+OFFSET = 1 << 20  # makes the coordinates of cells positive; they have 21 bits each in a key
 
 
 class FieldIndex(NamedTuple):
@@ -43,7 +43,8 @@ class FieldIndex(NamedTuple):
     size : float
         Size of the cells, see `MIN_CELL`; 0 for a single cell.
     keys, slots : (h,) int
-        Hash table: the cell of a key, see `_slot`.
+        Hash table: ``slots[at]`` is the cell with the key ``keys[at]``, see `_slot` and `_key`. A
+        key of 0 is free.
     """
 
     first: Indices
@@ -83,7 +84,7 @@ def field_index(cones: Array, farthest_km: float) -> FieldIndex:
 @borrowing_kernel
 def _slot(keys, key):
     """Return the slot of a key in the hash table, or the free one for it (keys are positive)."""
-    mask = len(keys) - 1
+    mask = len(keys) - 1  # the length is a power of two
     at = (key * 0x9E3779B97F4A7C1 >> 20) & mask
     while keys[at] != 0 and keys[at] != key:
         at = (at + 1) & mask
@@ -111,6 +112,8 @@ def _key(i, j, k):
 class Entering(NamedTuple):
     """Work arrays with which fields are entered in cells of one size.
 
+    size : float
+        As in `FieldIndex`.
     keys, slots : (h,) int
         As in `FieldIndex`.
     latest : (c,) int
@@ -156,10 +159,11 @@ def ground_range(position, axis, half):
 
 @kernel
 def cones_of(views):
-    """Return the cone about each field and its tracklets, (s, k, 7).
+    """Return the cone about each field and its tracklets, (s, k, 7), at k instants.
 
-    The sensor's position [km], the cone's axis, and the tangent of its half-angle: 0 without
-    tracklets. The axis is the boresight, or if it is unknown the normal of the sensor's plane.
+    The sensor's position [km, GCRF], the cone's axis, and the tangent of its half-angle: 0 without
+    tracklets. The axis is the boresight, or the normal of the sensor's plane where the boresight is
+    unknown or gives a wider cone.
     """
     n_sensors, n_instants, cam = views.camera.shape[0], len(views.time_s), views.camera
     cones, u = np.zeros((n_sensors, n_instants, 7)), np.empty(3)
@@ -194,7 +198,7 @@ def _enter(cones, farthest_km, size, capacity):
     Of `cones` (s, k, 7), see `cones_of`, as far as `farthest_km` from the Earth's centre. Returns
     `by_sensor_first` (s + 1,) and `by_sensor_cell` (v,), the number of cells, and `keys` and
     `slots` (h,), as in `FieldIndex`. The number of cells is -1 if there are more than `capacity`
-    entries.
+    entries: a sensor in a cell is one.
     """
     n_sensors, n_instants = cones.shape[0], cones.shape[1]
     table = 1
@@ -260,9 +264,9 @@ def _together(cones, s, m, size):
 def _walk(cones, sweep, farthest_km, entering):
     """Enter one cone, step by step along its axis; return false if the arrays are full.
 
-    `cones` (s, k, 7); `sweep` is the sensor, the instant, and the motion as in `_together`: shift
-    [km], turn [rad], tangent. A ball encloses each step. The walk ends beyond the farthest
-    distance, or at the Earth.
+    `cones` (s, k, 7); `sweep` is the sensor, the instant, and the motion until the last instant for
+    which this cone stands, as in `_together`: shift [km], turn [rad], tangent. A ball encloses each
+    step. The walk ends beyond the farthest distance, or at the Earth.
     """
     s, m, shift, turn, reach = sweep
     half = np.arctan(reach) + turn
@@ -314,7 +318,7 @@ def _enter_ball(cones, sweep, x, ball, entering):
     low[0], high[0] = int(np.floor(c0 - radius)), int(np.floor(c0 + radius))
     low[1], high[1] = int(np.floor(c1 - radius)), int(np.floor(c1 + radius))
     low[2], high[2] = int(np.floor(c2 - radius)), int(np.floor(c2 + radius))
-    ground2 = 1.0 / (size * size)
+    surface2 = 1.0 / (size * size)  # squared radius of the Earth, in cells
     for i in range(low[0], high[0] + 1):
         d0 = max(i - c0, c0 - i - 1.0, 0.0)
         for j in range(low[1], high[1] + 1):
@@ -324,7 +328,7 @@ def _enter_ball(cones, sweep, x, ball, entering):
                 if d0 * d0 + d1 * d1 + d2 * d2 > radius * radius:
                     continue
                 far0, far1, far2 = max(-i, i + 1), max(-j, j + 1), max(-k, k + 1)
-                if far0 * far0 + far1 * far1 + far2 * far2 < ground2:
+                if far0 * far0 + far1 * far1 + far2 * far2 < surface2:
                     continue  # all of the cell is inside the Earth
                 key = _key(i, j, k)
                 at = _slot(keys, key)
@@ -352,10 +356,12 @@ def _touches(cones, sweep, size, i, j, k):
     The cell is (i, j, k) of those with this size; `cones` and `sweep` as in `_walk`.
     """
     s, m, shift, turn, reach = sweep
+    # The cell's centre in the grid, and its distance there and in Earth radii, see `_cells_per_km`.
     y0, y1, y2 = (i + 0.5) * size, (j + 0.5) * size, (k + 0.5) * size
     f = max(np.sqrt(y0 * y0 + y1 * y1 + y2 * y2), 1e-9)
     r = np.exp(f - 1.0) if f > 1.0 else f
     scale = EARTH_RADIUS_KM * r / f
+    # Half the diagonal in km. A cell is larger on its far side, by the exponential.
     half_diagonal = 0.5 * np.sqrt(3.0) * size
     near_km = half_diagonal * EARTH_RADIUS_KM * max(r, 1.0) * np.exp(half_diagonal)
     d0 = y0 * scale - cones[s, m, 0]
@@ -451,8 +457,8 @@ def sensors_sharing(index, a, b, stamp, mark, out):
 def near_points(space, work, a, b):
     """Write to `work.near` the sensors whose field may hold the points; return their number.
 
-    Candidates come from the cells about the points. If the points are uncertain by more than a
-    cell, they come from the cells that sensors a and b share.
+    Candidates come from the cells about the points of `work`. If a point is uncertain by more than
+    a cell, they come from the cells that sensors a and b share. Writes `work.nearby` too.
     """
     index, points, n = space.fields, work.points, np.int64(0)
     mark, known = next_mark(work.stamp), True

@@ -30,9 +30,9 @@ from epipole.tasks.algorithms.association.search.sight_lines import quantile
 from epipole.tasks.algorithms.association.views import error_sr, residual, residual_chi2
 from epipole.tasks.algorithms.kernels import borrowing_kernel, inlined_kernel, kernel
 
-# A seed is given up if the log-odds of the other sensors are below the first, and the second number
-# of them at least has its points in the field. With one sensor, or -2, small scenes of
-# bench_association come out with other odds; with six, or -8, they do not.
+# A seed is given up if the log-odds that the other sensors add are below the first number, and its
+# points are in the fields of at least the second number of them. With one sensor, or -2, small
+# scenes of bench_association come out with other odds; with six, or -8, they do not.
 GIVE_UP_LOG_ODDS, MIN_LOOKS = -4.0, 3
 MIN_GAIN = 2.0  # minimum log-odds that a view adds to a well-known point, to join it
 MIN_LEAD = 5.0  # minimum difference of the log-odds of a sensor's best view and the next one
@@ -53,7 +53,7 @@ class Grown(NamedTuple):
     taken : (h,) bool
         It is clear, and its tracklets are entered in `SearchSpace.taken`.
     x_km : (h, 3) float
-        Position at the first instant.
+        Position at the first solved instant [km], GCRF.
     first_member, member : (h + 1,), (n,) int
         Tracklets of hypothesis q are ``member[first_member[q]:first_member[q + 1]]``, in order.
     first_missed, missed : (h + 1,), (m,) int
@@ -111,20 +111,18 @@ def grow_all(space, work, seeds, clear, min_score):
         if h == len(seed):
             seed, value_of, clears = _doubled(seed, h), _doubled(value_of, h), _doubled(clears, h)
             x_km = _doubled(x_km, h)
-            first_member, first_missed = (
-                _doubled(first_member, h + 1),
-                _doubled(first_missed, h + 1),
-            )
-        begin, skip = first_member[h], first_missed[h]
-        member, missed = _with_capacity(member, begin, n), _with_capacity(missed, skip, n_missed)
-        member[begin : begin + n] = members[:n]
-        missed[skip : skip + n_missed] = work.missed[:n_missed]
+            first_member = _doubled(first_member, h + 1)
+            first_missed = _doubled(first_missed, h + 1)
+        at, at_missed = first_member[h], first_missed[h]
+        member, missed = _with_capacity(member, at, n), _with_capacity(missed, at_missed, n_missed)
+        member[at : at + n] = members[:n]
+        member[at : at + n].sort()
+        missed[at_missed : at_missed + n_missed] = work.missed[:n_missed]
         x_km[h] = work.points.x_km[np.argmax(work.points.seen_by >= 2)]
-        member[begin : begin + n].sort()
         is_clear = _is_clear(space, work, members[:n], n_missed, value, clear)
         seed[h], value_of[h], clears[h] = q, value, is_clear
         h += 1
-        first_member[h], first_missed[h] = begin + n, skip + n_missed
+        first_member[h], first_missed[h] = at + n, at_missed + n_missed
         if is_clear:
             for i in members[:n]:
                 taken[i] = True
@@ -141,8 +139,9 @@ def _grow(space, work, members, nearby):
 
     Sensor after sensor, the tracklet that adds most to the odds joins, and a miss lowers them. The
     hypothesis is given up, with size 0, as soon as the log-odds of the other sensors are below
-    `GIVE_UP_LOG_ODDS` (Wald's sequential test). `members` (t + 2,) is changed in place; `nearby`
-    (n,) are the sensors that share space with those of the seed, in order.
+    `GIVE_UP_LOG_ODDS` (Wald's sequential test). The sensors of the seed come last: they may have
+    another fragment of the object. `members` (t + 2,) is changed in place; `nearby` (n,) are the
+    sensors that share space with those of the seed, in order.
     """
     views, near = space.views, work.near
     n = np.int64(2)  # for numba a literal 2 has another type: all would be compiled twice
@@ -150,31 +149,26 @@ def _grow(space, work, members, nearby):
     if n_near < 0:
         return np.int64(0), np.int64(0)
     a, b = views.sensor[members[0]], views.sensor[members[1]]
-    evidence, looked, early = 0.0, 0, np.int64(0)
+    evidence, looked = 0.0, 0  # log-odds by the other sensors, and how many should detect it
+    early = np.int64(0)  # members that were chosen before the points were well known
     nearest2 = nearest_range2(views, members[:n], work.points)
     begin, mark = np.searchsorted(near[:n_near], a), next_mark(work.stamp)
-    work.stamp[a] = work.stamp[b] = mark
+    work.stamp[a] = work.stamp[b] = mark  # as all sensors that had their turn
     turn = -1
     while turn < n_near + 1:
         turn += 1
-        if (
-            turn == n_near
-            and n > 2
-            and _has_unsolved_instant(views, members[:n], work.points.seen_by)
-        ):
+        all_looked = turn == n_near and n > 2
+        if all_looked and _has_unsolved_instant(views, members[:n], work.points.seen_by):
+            # With more points, other sensors may be near: those that had no turn get one.
             n = _settle(space, work, members, n)
             if n < 2:
                 return np.int64(0), np.int64(0)
             n_near, turn = np.int64(near_fields(views, work.points, nearby, near)), -1
             continue
-        # The sensors of the seed come last: they may have another fragment of the object.
-        if turn < n_near:
-            s = near[(begin + turn) % n_near]
-            if work.stamp[s] == mark:
-                continue
-            work.stamp[s] = mark
-        else:
-            s = a if turn == n_near else b
+        s = _sensor_of_turn(near[:n_near], begin, turn, a, b)
+        if turn < n_near and work.stamp[s] == mark:
+            continue
+        work.stamp[s] = mark
         before = n
         n, evidence, detected = _join_sensor(space, work, s, members, n, evidence)
         if n < 0:
@@ -182,9 +176,8 @@ def _grow(space, work, members, nearby):
         if n > before and before < WELL_KNOWN:
             early = min(n, np.int64(WELL_KNOWN))
             nearest2 = nearest_range2(views, members[:n], work.points)
-        elif n > before:
-            more = nearest_range2(views, members[before:n], work.points)
-            nearest2 = min(nearest2, more)
+        elif n > before:  # the points hardly move
+            nearest2 = min(nearest2, nearest_range2(views, members[before:n], work.points))
         if turn < n_near:
             expected = detected or should_detect(views, s, work.points, nearest2)
             looked += expected
@@ -198,6 +191,14 @@ def _grow(space, work, members, nearby):
         if n >= MIN_REVIEWED:
             n = _review(space, work, members, n, early)
     return n, n_near
+
+
+@borrowing_kernel
+def _sensor_of_turn(near, begin, turn, a, b):
+    """Return the sensor of a turn: those of `near` (n,), from row `begin` on, then a, then b."""
+    if turn < len(near):
+        return near[(begin + turn) % len(near)]
+    return a if turn == len(near) else b
 
 
 @borrowing_kernel
@@ -271,8 +272,8 @@ def _settle(space, work, members, n):
     """Solve the points and drop the members that fit worst, until all fit; return the size.
 
     Changes the first n of `members` (t + 2,), and `work.points`. The seed's tracklets may be
-    dropped too. Large hypotheses drop several at a time, so the cost grows with their size only.
-    The size is 0 if fewer than two are left.
+    dropped too. Large hypotheses drop several at a time, so the cost does not grow with the square
+    of their size. The size is 0 if no two members fit.
     """
     views, part = space.views, work.part
     X, _, _, seen_by = work.points
@@ -283,11 +284,11 @@ def _settle(space, work, members, n):
         if n == 2:
             break
         for q in range(n):
-            total, shared = 0.0, 1e-9
+            total, shared = 0.0, 1e-9  # a member without a solved instant has chi-square 0
             for m in range(len(views.time_s)):
                 if seen_by[m] < 2 or not views.seen[members[q], m]:
                     continue
-                if residual(views, members[q], m, X[m], part) == 0.0:
+                if residual(views, members[q], m, X[m], part) == 0.0:  # behind the sensor
                     total = np.inf
                 total += residual_chi2(part)
                 shared += 1
@@ -306,16 +307,18 @@ def _settle(space, work, members, n):
 
 @borrowing_kernel
 def _review(space, work, members, n, early):
-    """Choose the first `early` members again, now that the points are well known; return the size.
+    """Choose the members of the first `early` ones' sensors again; return the size.
 
     Changes `members` (t + 2,), of which the first n count. The early ones were chosen with points
-    from few views. A false member does more harm than a miss. So a tracklet joins only if it adds
-    at least `MIN_GAIN`, and leads the sensor's next best one by `MIN_LEAD` if that one adds as
-    much. All other members stay if they still fit.
+    from few views; now the points are well known. A false member does more harm than a miss. So a
+    tracklet joins only if it adds at least `MIN_GAIN`, and leads the sensor's next best one by
+    `MIN_LEAD` if that one adds as much. All other members stay if they still fit. If fewer than
+    `MIN_REVIEWED` - 1 are left, nothing is changed.
     """
     views, stamp, early = space.views, work.stamp, min(early, n)
     mark = next_mark(stamp)
-    n_again = 0  # the sensors of the early members, in order, in `work.missed`
+    # The sensors of the early members are sorted into `work.missed`, which is free here.
+    n_again = 0
     for i in members[:early]:
         s = views.sensor[i]
         if stamp[s] != mark:

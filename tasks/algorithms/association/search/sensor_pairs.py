@@ -33,17 +33,17 @@ from epipole.tasks.algorithms.association.views import (
 from epipole.tasks.algorithms.constants import EARTH_RADIUS_KM
 from epipole.tasks.algorithms.kernels import borrowing_kernel, kernel
 
-NEAREST_STEP_KM, N_STEPS = 20.0, 64  # along a field, to test whether it meets another one
+NEAREST_STEP_KM, N_STEPS = 20.0, 64  # along a cone, to test whether it meets another one
 MAX_TESTED_INSTANTS = 8  # of the instants at which both sensors have tracklets
 N_LEADERS = 8  # sensors of a crowded cell with which all others there are paired
 MAX_OVERLAPPING = 64  # maximum number of others that a sensor is paired with, half of them leaders
 MAX_TESTS = 512  # maximum number of tests per sensor of whether two fields overlap
-FEW_TRACKLETS = 8  # of a sensor in a window: seeding with fewer costs next to nothing
-# Lines of sight pass near each other within this angle, distance, and number of sigmas together:
-# far more than what is one object misses by, and few others do.
+FEW_TRACKLETS = 8  # of a sensor in a window: seeding with no more costs next to nothing
+# Lines of sight pass near each other if their gap is within the sum of this angle, this distance,
+# and this number of sigmas: far more than those of one object miss by, and few others do.
 PASSING_RAD, PASSING_KM, PASSING_SIGMA = 5e-3, 20.0, 5.0
-N_EDGES = 8  # outermost tracklets of a sensor, one for each of the axes on its plane
-# Share of a crowded field that counts as covered by a pair: its edges are left out.
+N_EDGES = 8  # outermost tracklets of a sensor, one for each of these directions on its plane
+# Part of a crowded field's half-angle within which a pair covers points: its edges are left out.
 MIDDLE_SHARE = 0.5
 
 
@@ -71,9 +71,10 @@ def fields_meet(cones: Array, a: Indices, b: Indices, farthest_km: float) -> Fla
     """Return whether the fields of two sensors overlap anywhere, (n,) bool.
 
     At some of the instants at which both have tracklets, the axis of sensor a's cone is followed in
-    steps. A ball about each step encloses the cone up to the next one, and is tested for contact
-    with the cone of b. Cones end at the ground. The result is never false if the fields overlap at
-    a tested instant, but may be true if they do not.
+    steps. A ball about each step encloses the cone half-way to the next steps, and is tested for
+    contact with the cone of b. Cones end at the ground. The result may be true if the fields do not
+    overlap. It is not false if they overlap at a tested instant, at ranges from sensor a that
+    exceed `NEAREST_STEP_KM`.
 
     Parameters
     ----------
@@ -105,7 +106,7 @@ def _meet(cones, steps, a, b):
 
     `cones` (s, k, 7) as there; `steps` (n,) [km] along the cone of sensor a grow by a fixed ratio.
     """
-    step, common = steps[1] / steps[0], 0
+    ratio, common = steps[1] / steps[0], 0
     for m in range(cones.shape[1]):
         common += cones[a, m, TANGENT] > 0.0 and cones[b, m, TANGENT] > 0.0
     # Evenly spread over the common instants, first and last included.
@@ -117,12 +118,13 @@ def _meet(cones, steps, a, b):
         if (passed - 1) * (n_tested - 1) < tested * (common - 1):
             continue
         tested += 1
-        tangent, half_b = cones[a, m, TANGENT] + (step - 1) / 2, np.arctan(cones[b, m, TANGENT])
+        # The ball about a step, over the range: the cone's radius and half the way to the next.
+        tangent, half_b = cones[a, m, TANGENT] + (ratio - 1) / 2, np.arctan(cones[b, m, TANGENT])
         ends_a = ground_range(cones[a, m, :AXIS], cones[a, m, AXIS:TANGENT],
                               np.arctan(cones[a, m, TANGENT]))  # fmt: skip
         ends_b = ground_range(cones[b, m, :AXIS], cones[b, m, AXIS:TANGENT], half_b)
         for rho in steps:
-            if rho > step * ends_a:
+            if rho > ratio * ends_a:
                 break
             along, length2 = 0.0, 0.0
             for q in range(AXIS):
@@ -142,10 +144,9 @@ def _meet(cones, steps, a, b):
 
 @kernel
 def _overlapping_pairs(index, rank, cones, steps):
-    """Return pairs of sensors, (n, 2); some of them twice.
+    """Return the pairs of `meeting_pairs` among many sensors, (n, 2); some of them twice.
 
-    Those of which `_meet` finds that they meet, by `cones` (s, k, 7) and `steps` (j,) [km].
-    `rank` (s,) is of `_leaders`.
+    `cones` (s, k, 7) and `steps` (j,) [km] are for `_meet`, `rank` (s,) for `_leaders`.
     """
     n_sensors, n_cells = len(index.by_sensor_first) - 1, len(index.first) - 1
     leader, occupied = _leaders(index, rank), np.empty(n_cells, np.int64)
@@ -158,6 +159,7 @@ def _overlapping_pairs(index, rank, cones, steps):
         cells = index.by_sensor_cell[index.by_sensor_first[s] : index.by_sensor_first[s + 1]]
         order = np.argsort(occupied[cells], kind="mergesort")
         tested[s], count, tests = s, 0, 0
+        # First the crowded cells, from the fullest on; then all, from the emptiest on.
         for turn in range(2 * len(cells)):
             crowded = turn < len(cells)
             q = cells[order[len(cells) - 1 - turn]] if crowded else cells[order[turn - len(cells)]]
@@ -182,9 +184,9 @@ def _overlapping_pairs(index, rank, cones, steps):
 
 @kernel
 def _leaders(index, rank):
-    """Return the sensors with the lowest ranks in each crowded cell, (c, 8); -1 elsewhere.
+    """Return the `N_LEADERS` sensors with the lowest ranks in each crowded cell; -1 in others.
 
-    `rank` (s,) int is the rank of each sensor.
+    They are (c, N_LEADERS) int, by rank. `rank` (s,) int is the rank of each sensor.
     """
     leader = np.full((len(index.first) - 1, N_LEADERS), -1)
     for q in range(len(leader)):
@@ -261,16 +263,16 @@ def _passing(views, sparse, farthest_km):
 def _pass_near(camera_a, u_a, camera_b, u_b, rad, km, farthest_km):
     """Return whether two lines of sight pass within some angle and distance, above the ground.
 
-    Nearly parallel lines always do. `camera_a` and `camera_b` (33,) are rows of `Views.camera`, of
-    which the positions are read [km]; `u_a` and `u_b` (3,) are unit vectors, ICRS. `rad` [rad] and
-    `km` [km] together limit the gap.
+    Nearly parallel lines always do; nearly opposite ones never. `camera_a` and `camera_b` (33,) are
+    rows of `Views.camera`, of which the positions are read [km]; `u_a` and `u_b` (3,) are unit
+    vectors, ICRS. `rad` [rad] and `km` [km] together limit the gap.
     """
     cosine, along_a, along_b = 0.0, 0.0, 0.0
-    for x in range(3):
-        d = camera_b[x] - camera_a[x]
-        cosine += u_a[x] * u_b[x]
-        along_a += d * u_a[x]
-        along_b += d * u_b[x]
+    for k in range(3):
+        d = camera_b[k] - camera_a[k]
+        cosine += u_a[k] * u_b[k]
+        along_a += d * u_a[k]
+        along_b += d * u_b[k]
     sine2 = 1.0 - cosine * cosine
     if sine2 < 4.0 * rad * rad:
         return cosine > 0.0
@@ -278,8 +280,8 @@ def _pass_near(camera_a, u_a, camera_b, u_b, rad, km, farthest_km):
     if not (0.0 < range_a < farthest_km and 0.0 < range_b < farthest_km):  # false for NaN
         return False
     gap2, radius2 = 0.0, 0.0
-    for x in range(3):
-        at_a, at_b = camera_a[x] + range_a * u_a[x], camera_b[x] + range_b * u_b[x]
+    for k in range(3):
+        at_a, at_b = camera_a[k] + range_a * u_a[k], camera_b[k] + range_b * u_b[k]
         gap2 += (at_b - at_a) ** 2
         radius2 += at_a * at_a
     allowed = rad * max(range_a, range_b) + km
@@ -331,8 +333,9 @@ class SensorPairs:
         across = np.linalg.norm(np.cross(baseline, look[a] + look[b]), axis=1) / 2
         order = np.flatnonzero(known)[np.argsort(-across[known], kind="stable")]
         self._a, self._b = a[order], b[order]
-        middle, many = (look, position, half), n_overlapping > FEW_SENSORS
+        middle, many = (look, position, half), n_overlapping > FEW_SENSORS  # in crowded space
         few = ~many[self._a] & ~many[self._b]
+        # Points of the shared space: one in the middle, others at the edges where few sensors are.
         self._points = np.full((len(order), 1 + N_EDGES, 3), np.nan)
         self._points[:, 0] = _middle_points(middle, many, self._a, self._b, farthest_km)
         self._points[few, 1:] = _shared_points(
@@ -343,13 +346,13 @@ class SensorPairs:
         self._always = sparse[self._a] & sparse[self._b]
         self._waiting = np.ones(len(order), bool)
         self._busy = np.zeros(len(look), bool)
-        # Earlier pairs that cover each point of a pair. A point that is not shared (NaN) counts as
-        # covered.
+        # How many earlier pairs cover each point of a pair. A point that is not shared (NaN) counts
+        # as covered.
         shared = np.isfinite(self._points[..., 0])
         self._covered = np.where(shared, 0, np.iinfo(np.int64).max)
         self._index = index
         cell = _cells_of(index, self._points)
-        self._by_cell = np.argsort(cell, axis=None, kind="stable")
+        self._by_cell = np.argsort(cell, axis=None, kind="stable")  # see `_cover`
         self._first = np.searchsorted(cell.ravel()[self._by_cell], np.arange(len(index.first)))
         self._next = 0
 
@@ -383,9 +386,9 @@ def _next_pair(a, b, always, waiting, covered, busy, enough, begin):
     """Return the first pair from `begin` on that should seed, its sensors not busy, or -1.
 
     The n pairs are of the sensors `a` (n,) and `b` (n,). Those that have not seeded are
-    `waiting` (n,), bool. Of these one seeds if it is flagged in `always` (n,), or if
-    `covered` (n, p), the number of earlier pairs that cover each of its p points, is below `enough`
-    for a point. `busy` (s,) bool flags sensors.
+    `waiting` (n,), bool. Of these one seeds if it is flagged in `always` (n,), or if one of its p
+    points is covered by fewer than `enough` earlier pairs, as `covered` (n, p) counts. `busy` (s,)
+    bool flags sensors that have seeded in this turn.
     """
     for k in range(begin, len(a)):
         if waiting[k] and not busy[a[k]] and not busy[b[k]]:
@@ -399,7 +402,7 @@ def _next_pair(a, b, always, waiting, covered, busy, enough, begin):
 
 @kernel
 def _cover(index, a, b, middle, share, points, first, by_cell, covered):
-    """Count the pair of sensors a and b for all points that both have in their field.
+    """Count the pair of sensors a and b in `covered` for all points that both have in their field.
 
     Parameters
     ----------
@@ -454,11 +457,12 @@ def _cells_of(index, points):
 
 @kernel
 def _middle(views, n_edges):
-    """Return each sensor's mean direction, position [km], and radius of its tracklets [rad].
+    """Return for each sensor the middle of its tracklets, where it is, and how far they reach.
 
-    All are (s, 3), (s, 3), (s,), at the instant with the most tracklets; NaN without tracklets. The
+    At the instant at which it has most tracklets: the normal of its plane (s, 3), its position
+    (s, 3) [km], and the largest angle of a tracklet from the normal (s,) [rad], with a margin. The
     fourth value are the directions of the outermost tracklets along `n_edges` axes of the plane,
-    (s, n_edges, 3).
+    (s, n_edges, 3). All are in the GCRF; without tracklets NaN, the angle 0.
     """
     n = views.camera.shape[0]
     look, position, half = np.full((n, 3), np.nan), np.full((n, 3), np.nan), np.zeros(n)
@@ -497,8 +501,11 @@ def _middle_points(
     """Return a point [km] in the middle of the space that each pair of sensors shares, (n, 3).
 
     It is the closest approach of the two axes. For nearly parallel axes that point is arbitrary.
-    So in crowded space, the closest approach of one sensor of the pair and the first sensor that
-    it is paired with (longest baseline) is taken instead, if it is well inside the other's field.
+    So in crowded space, the point of another pair is taken instead, if it is well inside the field:
+    of one sensor of this pair and the first that it is paired with (longest baseline).
+
+    `middle` is that of `_middle`, `many` (s,) are the sensors in crowded space, and a, b (n,) the
+    pairs, the longest baseline first.
     """
     look, position, half = middle
     range_a, _, _ = _closest_approach(position[b] - position[a], look[a], look[b])

@@ -21,7 +21,11 @@ from epipole.tasks.algorithms.star_identification.frame import (
     aberrate_all,
 )
 from epipole.tasks.algorithms.star_identification.search.pair_hypotheses import MAX_BETA
-from epipole.tasks.algorithms.star_identification.sensor import IdentifiedSensor
+from epipole.tasks.algorithms.star_identification.sensor import (
+    ASSUMED_IN_VIEW,
+    MIN_CENTROIDS,
+    IdentifiedSensor,
+)
 from epipole.tasks.algorithms.star_identification.sensor_model import Skies, scale_of
 from epipole.tasks.algorithms.star_identification.star_grid import Sky
 
@@ -81,6 +85,7 @@ def agreeing_candidates(
 def _agree(
     u: Array, sigma_rad: Array, star_u: Array, centroid: Indices, star: Indices, gate_sigma: float
 ) -> Flags:
+    """Return which candidates agree with each other, (c, c). Arguments as `agreeing_candidates`."""
     measured, listed = chords(u)[np.ix_(centroid, centroid)], chords(star_u[star])
     variance = sigma_rad[centroid] ** 2
     tolerance = gate_sigma * np.sqrt(variance[:, None] + variance) + MAX_BETA * measured
@@ -110,7 +115,7 @@ def _same_hand(u: Array, s: Array) -> bool:
 # catalogue, -1 where a centroid is not identified.
 Matcher = Callable[[Array, Array], Indices]
 
-ASSUMED_SIGMA_PX = 0.5  # of centroids without sigma; the published maps have it
+ASSUMED_SIGMA_PX = 0.5  # of centroids without sigma, as in the published star maps
 
 
 def solve_matches(
@@ -153,10 +158,10 @@ def identify_each_frame(
         Prepares a method for a camera and its sky.
     """
     counts = centroids.counts
-    usable = counts[counts >= 4]
+    usable = counts[counts >= MIN_CENTROIDS]
     if magnitude_limit is None:
-        density = float(np.median(usable)) if len(usable) else 10.0
-        magnitude_limit = skies.limit_for(density / centroids.optics[0].solid_angle_sr)
+        in_view = float(np.median(usable)) if len(usable) else ASSUMED_IN_VIEW
+        magnitude_limit = skies.limit_for(in_view / centroids.optics[0].solid_angle_sr)
     sky = skies.sky(magnitude_limit)
     stated = bool(np.isfinite(centroids.sigma_px).any())
     match = make_matcher(sky, centroids.optics[0])

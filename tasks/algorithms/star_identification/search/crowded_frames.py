@@ -64,10 +64,10 @@ MIN_FIELD_LOG_ODDS = 8.0  # from `field_log_odds`, to try an attitude on all cen
 DISC_SAMPLES = 64  # points at which a pivot's surroundings are sampled
 PIVOT_TIERS = 4  # pivots are put in order by quarters of their surroundings in the image
 MAX_VOTES = 512  # for one star; further ones are left out
-BIN_SHIFT = 8  # of the 16 bits of a roll, those below its bin: 256 bins
-MAX_BINS = 4096  # of separation
-# Number of look-ups in the roll table, of votes, and of pairs of votes in a unit of work; and the
-# units of work of a star beside these.
+BIN_SHIFT = 8  # a roll has 16 bits (see `TURN`); without the last 8 it is its bin, one of 256
+MAX_BINS = 4096  # of separation, where tolerances are small
+# Work (see `SearchLimits`): in one unit, this number of neighbours is looked up in the roll table,
+# of votes counted, or of pairs of votes compared. Each star takes some units more.
 NEIGHBOURS_PER_WORK, VOTES_PER_WORK, AGREED_PER_WORK, STAR_WORK = 3, 2, 20, 10
 
 
@@ -75,12 +75,13 @@ class Companions(NamedTuple):
     """The near companions of a pivot, by separation.
 
     row : (n,) int64, centroids
-    chord, tolerance : (n,) float
+    chord, tolerance : (n,) float, separation from the pivot, as a chord, and its tolerance [rad]
     angle, wide : (n,) int64, position angle about the pivot and its tolerance, in parts of `TURN`
-    magnitude, difference : (n,) float, implied, see `votes.implied_magnitudes`
-    first : (bins + 4,) int64; the companions within a tolerance of the separation c are in the rows
+    magnitude, difference : (n,) float [mag], of the companion, and of the pivot less that of the
+        companion; see `votes.implied_magnitudes`
+    first : (bins + 4,) int64; the companions within a tolerance of the chord c are in the rows
         first[k]:first[k + 3], k = floor(c scale)
-    scale : float, bins per unit of separation
+    scale : float, bins per unit of chord; a bin is as wide as the largest tolerance
     """
 
     row: Integers
@@ -166,18 +167,19 @@ def _pivots(inside):
 
 @borrowing_kernel
 def _contradicts(m_s, m_other, q, companions, mag_gate):
-    """Return whether companion q is too bright or too faint for a neighbour of magnitude m_other of
-    a star of magnitude m_s. Comparisons with NaN are false.
+    """Return whether companion q is too bright or too faint for the neighbour of a star.
 
-    mag_gate [mag] is the gate of one magnitude; that of a difference is wider by the root of two.
+    m_s and m_other [mag] are of the star and of the neighbour. mag_gate [mag] is the gate of one
+    magnitude; that of a difference is wider by the root of two. What is unknown (NaN) contradicts
+    nothing.
     """
-    odd = abs(m_s - m_other - companions.difference[q]) > 1.414 * mag_gate
-    return odd | (abs(m_other - companions.magnitude[q]) > mag_gate)
+    differs = abs(m_s - m_other - companions.difference[q]) > 1.414 * mag_gate
+    return differs | (abs(m_other - companions.magnitude[q]) > mag_gate)
 
 
 @borrowing_kernel
 def _roll_votes_of(s, near, magnitude, mag_gate, companions, votes):
-    """Write the votes of star s to `votes`; return their number, the fullest bin, and its votes.
+    """Write the votes of star s to `votes`; return how many, the fullest bin, and how many it has.
 
     `near` are the `NearStars`, `magnitude` (m,) [mag] those of the catalogue; mag_gate as in
     `_contradicts`.
@@ -221,8 +223,8 @@ def _agree(k, m, votes):
 
 @borrowing_kernel
 def _vote_with_most_agreeing(n, at_bin, votes):
-    """Return which of the first n votes that touch a bin agrees with most votes, and with how many,
-    itself included."""
+    """Return which of the votes that touch a bin agrees with most of the first n votes, and with
+    how many, itself included."""
     best, most = 0, 0
     for k in range(n):
         if not _touches(k, at_bin, votes):
@@ -237,8 +239,8 @@ def _vote_with_most_agreeing(n, at_bin, votes):
 
 @borrowing_kernel
 def _farthest_agreeing_vote(n, k, near, votes):
-    """Return which of the first n votes that agree with vote k has the farthest neighbour, and the
-    number of votes that agree with it. This vote determines the roll best."""
+    """Return the vote with the farthest neighbour, of the first n votes those that agree with vote
+    k, and how many votes agree with it. It determines the roll best."""
     best, agreed = k, 0
     for m in range(n):
         if _agree(k, m, votes) and near.chord[votes.entry[m]] > near.chord[votes.entry[best]]:
@@ -263,9 +265,10 @@ def _stars_like(m_i, magnitude, n_stars, mag_gate):
 
 @kernel
 def _try_star(problem, i, s, j, other, c, scratch, best):
-    """Try star s for pivot i and star `other` for centroid j, c apart; return the work done.
+    """Try star s for pivot i and star `other` for centroid j; return the work done.
 
-    c is the chord between the stars. `scratch`, a `PairScratch`, and `best`, a `Best`, are written.
+    c [rad] is the chord between the stars. `scratch`, a `PairScratch`, and `best`, a `Best`, are
+    written.
     """
     n, n_checked = len(problem.centroids.u), len(scratch.gain)
     order = prepare_pair(problem, i, j, c, scratch)
@@ -301,11 +304,11 @@ def _try_pivot(problem, i, inside, step, stars, cells, n_agreeing, votes, scratc
     for s in range(start, stop if min_votes <= MAX_COUNTED else start):
         if n_agreeing[s] < min_votes:
             continue
-        n, at_bin, most = _roll_votes_of(s, near, magnitude, mag_gate, companions, votes)
+        n, at_bin, n_in_bin = _roll_votes_of(s, near, magnitude, mag_gate, companions, votes)
         work += STAR_WORK + n // VOTES_PER_WORK
-        if most < min_votes:
+        if n_in_bin < min_votes:
             continue
-        work += most * n // AGREED_PER_WORK
+        work += n_in_bin * n // AGREED_PER_WORK
         k, agreed = _vote_with_most_agreeing(n, at_bin, votes)
         if agreed < min_votes:
             continue

@@ -1,11 +1,12 @@
 """Coarse votes for the roll: of each star that a pivot may be, how many neighbours agree.
 
 The companions of a pivot are entered once in a table. Its rows are bins of separation, its bits
-bins of position angle: bit b of a row is set if a companion has that separation and stands at bin
-b. Each neighbour of a star votes with the row of its separation, rotated by its position angle: the
-bits set are the rolls at which some companion falls on it. Adding up the rows of all neighbours
-bit by bit gives the number of votes for each roll. So a neighbour takes a few nanoseconds, however
-many companions there are.
+bins of roll: bit b is set if some companion with that separation falls, at roll b, on a neighbour
+at position angle 0. A neighbour at another angle has the same bits, rotated by its bin of position
+angle. Within the bin, its angle still matters: the table has a row for each of `PARTS` parts of a
+bin. Each neighbour of a star votes with its row, rotated. Adding up these rows bit by bit gives the
+number of votes for each roll. So a neighbour takes a few nanoseconds, however many companions there
+are.
 """
 
 from typing import NamedTuple
@@ -17,18 +18,18 @@ from epipole.tasks.algorithms.kernels import borrowing_kernel, kernel
 from epipole.tasks.algorithms.star_identification.star_pairs import TURN
 
 MAX_COUNTED = 6  # votes for a roll; further ones are not counted
-MAX_ROWS = 1024  # of separation
+MAX_ROWS = 1024  # of separation, where tolerances are small
 ROLL_BINS = 128  # of a full turn: the bits of two words
 BIN_WIDTH = TURN // ROLL_BINS
-PARTS = 4  # of a bin, to which a neighbour's position angle is taken
+PARTS = 4  # of a bin of position angle
 
 
 class RollTable(NamedTuple):
     """Companions of a pivot by separation and position angle.
 
-    word : (rows, PARTS, 2) uint64, the bits. Row k is for separations from k / scale to
-        (k + 1) / scale, part h for position angles of neighbours in part h of their bin
-    scale : float, rows per unit of separation
+    word : (rows, PARTS, 2) uint64, the bits, 64 in each word. Row k is for chords from k / scale
+        to (k + 1) / scale, part h for neighbours whose position angle is in part h of its bin
+    scale : float, rows per unit of chord
     """
 
     word: npt.NDArray[np.uint64]
@@ -56,11 +57,11 @@ def make_roll_table(chord, tolerance, angle, wide, reach):
         low = max(int((chord[q] - tolerance[q]) / widest), 0)
         high = min(int((chord[q] + tolerance[q]) / widest), len(word) - 1)
         for h in range(PARTS):
+            # Rolls: position angle of the neighbour less that of the companion.
             start = h * BIN_WIDTH // PARTS - angle[q] - wide[q]
             stop = (h + 1) * BIN_WIDTH // PARTS - angle[q] + wide[q]
-            for b in range(
-                start // BIN_WIDTH, min(stop // BIN_WIDTH, start // BIN_WIDTH + ROLL_BINS - 1) + 1
-            ):
+            first = start // BIN_WIDTH
+            for b in range(first, min(stop // BIN_WIDTH, first + ROLL_BINS - 1) + 1):
                 bit = np.uint64(1) << np.uint64(b & 63)
                 for k in range(low, high + 1):
                     word[k, h, (b >> 6) & 1] |= bit
@@ -117,15 +118,15 @@ def count_roll_votes(near, start, stop, roll_table, share, min_votes, max_stars,
         The smallest number of votes, at least `min_votes`, that `max_stars` stars or fewer reach;
         `MAX_COUNTED` + 1 if more stars reach every number.
     """
-    stars = np.zeros(MAX_COUNTED + 1, np.int64)
+    stars = np.zeros(MAX_COUNTED + 1, np.int64)  # how many have each number of votes
     for s in range(start, stop):
         agreed = _n_agreeing(near, s, roll_table)
         # Of many neighbours, many agree accidentally.
         enough = agreed == MAX_COUNTED or agreed >= share * (near.first[s + 1] - near.first[s])
         n_agreeing[s] = agreed if enough else 0
         stars[n_agreeing[s]] += 1
-    enough, total = MAX_COUNTED + 1, 0
-    while enough > min_votes and total + stars[enough - 1] <= max_stars:
-        enough -= 1
-        total += stars[enough]
-    return enough
+    votes, total = MAX_COUNTED + 1, 0
+    while votes > min_votes and total + stars[votes - 1] <= max_stars:
+        votes -= 1
+        total += stars[votes]
+    return votes

@@ -29,7 +29,7 @@ class CentroidCells(NamedTuple):
 
     first : (CELLS**2 + 1,) int32; the centroids of a cell are the rows first[cell]:first[cell + 1]
     xy : (n, 2) float, normalised image coordinates
-    corner, per_cell : (2,) float, of the image, and cells per unit of x and y
+    corner, per_cell : (2,) float, lowest x and y of the image, and cells per unit of x and y
     """
 
     first: npt.NDArray[np.int32]
@@ -43,7 +43,7 @@ class Pair(NamedTuple):
 
     x, y : its middle, normalised image coordinates
     noise2 : mean of the squared errors of both [rad^2]
-    c : chord between them
+    c : chord between them [rad]
     density : share of the image within the gate of a centroid, per squared error [1/rad^2]
     """
 
@@ -108,7 +108,7 @@ def field_log_odds(problem, i, s, j, other, c, stars, cells, scratch):
     Parameters
     ----------
     c : float
-        Chord between the two stars.
+        Chord between the two stars [rad].
     stars, cells : StarBands, CentroidCells
         All stars, and the frame's centroids.
     """
@@ -118,8 +118,10 @@ def field_log_odds(problem, i, s, j, other, c, stars, cells, scratch):
     y = 0.5 * (u[i, 1] / u[i, 2] + u[j, 1] / u[j, 2])
     noise2 = 0.5 * (sigma[i] * sigma[i] + sigma[j] * sigma[j])
     pair = Pair(x, y, noise2, c, math.pi * GATE * GATE * len(u) / problem.image.area)
+    # Cosine of the angle between boresight and corner.
     least = 1.0 / math.sqrt(1.0 + max(-box[0], box[1]) ** 2 + max(-box[2], box[3]) ** 2)
-    # The two stars of the pair have centroids in any case: they tell nothing.
+    # The two stars of the pair have centroids in any case: they tell nothing. Their ratios, which
+    # the loop below includes, are divided out first.
     odds = -2.0 * math.log(DETECTED_SHARE / min(pair.density * 2.0 * noise2, 0.5 * DETECTED_SHARE))
     x, y, z = R[2, 0], R[2, 1], R[2, 2]
     cone, ratio, looked = cells_of_cone(x, y, z, least), 1.0, 0
@@ -146,6 +148,7 @@ def _ratio_of_star(star, z, R, box, pair, cells):
     if not (box[0] < x < box[1] and box[2] < y < box[3]):
         return 1.0
     d2 = (x - pair.x) ** 2 + (y - pair.y) ** 2
+    # Error of the predicted position: it grows with the distance from the pair, over its length.
     s2 = pair.noise2 * (1.5 + 2.0 * d2 / (pair.c * pair.c)) + MAX_BETA * MAX_BETA * d2
     chance = pair.density * s2
     if chance > 0.5 * DETECTED_SHARE:  # with or without a centroid, it tells nothing

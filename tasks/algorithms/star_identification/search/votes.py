@@ -1,9 +1,9 @@
 """Which star a centroid may be, by votes of its companions.
 
 One centroid is the pivot, the others its companions. A companion has some separation from the
-pivot. Each pair of catalogue stars with that separation votes for one of its stars to be the pivot,
-with one roll of the image about it. A right hypothesis (a star and a roll) gets a vote from nearly
-every true star of the frame. This is a Hough transform over star and roll.
+pivot. Each pair of catalogue stars with that separation gives two votes: either of its stars may be
+the pivot, each with one roll of the image about it. A right hypothesis (a star and a roll) gets a
+vote from nearly every true star of the frame. This is a Hough transform over star and roll.
 
 1. Votes are counted in coarse cells of star and roll (`count_votes`): a few nanoseconds each.
 2. The cells are much wider than a roll is uncertain, so most that reach enough votes are
@@ -24,16 +24,20 @@ from epipole.tasks.algorithms.star_identification.star_pairs import TURN, range_
 
 GATE, MAG_GATE = 2.0, 2.0  # of a pair's separation [sigma], of brightness [1-sigma scatter]
 MIN_BINS_LOG2, MAX_BINS_LOG2 = 4, 8  # of roll, in a full turn
-MAX_MEAN_VOTES = 0.1  # per cell: chance seldom adds up to many
+MAX_MEAN_VOTES = 0.1  # per cell: false votes seldom agree then
+MAX_CELL_VOTES = 255  # in one cell, which has a byte; further ones are not counted
 
 
 class Votes(NamedTuple):
     """Votes of one pivot's companions.
 
-    cast : (stars << MAX_BINS_LOG2,) uint8, votes for a star and a roll
-    reached : (256,) int64, reached[v] cells have v votes or more; counted from v = 2 on
-    companion, low, high : (n,) the companions and their ranges of pairs
-    angle, wide : (n,) their position angles about the pivot and the tolerances of these, in
+    cast : (stars << MAX_BINS_LOG2,) uint8, the votes of each cell: that of a star and one of 2^log2
+        bins of roll is number (star << log2) + bin
+    reached : (MAX_CELL_VOTES + 2,) int64, reached[v] cells have v votes or more; counted from v = 2
+        on. The last one is 0: a search for a number that few cells reach ends there
+    companion, low, high : (n,) int64, the companions, rows of the centroids, and the ranges of the
+        pairs with their separation
+    angle, wide : (n,) int64, their position angles about the pivot and the tolerances of these, in
         parts of `TURN`
     """
 
@@ -51,7 +55,7 @@ def make_votes(n_stars, n):
     """Return room for the votes of n companions (compiled)."""
     return Votes(
         np.empty(n_stars << MAX_BINS_LOG2, np.uint8),
-        np.empty(256, np.int64),
+        np.empty(MAX_CELL_VOTES + 2, np.int64),
         np.empty(n, np.int64),
         np.empty(n, np.int64),
         np.empty(n, np.int64),
@@ -62,8 +66,11 @@ def make_votes(n_stars, n):
 
 @kernel
 def roll_bits(n_votes, n_stars, tolerance):
-    """Return log2 of the number of bins of roll, for a number of votes whose rolls have this
-    typical tolerance, in parts of `TURN` (compiled)."""
+    """Return log2 of the number of bins of roll (compiled).
+
+    `tolerance` is the typical one of the votes' rolls, in parts of `TURN`; a bin is at least twice
+    as wide. There are not more bins than `MAX_MEAN_VOTES` needs.
+    """
     fine = math.log2(TURN / max(2.0 * tolerance, 1.0))
     sparse = math.log2(max(n_votes / (MAX_MEAN_VOTES * n_stars), 1.0)) + 1.0
     return int(min(max(min(fine, sparse), MIN_BINS_LOG2), MAX_BINS_LOG2))
@@ -76,7 +83,7 @@ def companion(centroids, i, j, min_chord):
     Returns
     -------
     chord, tolerance : float
-        Chord between the two directions, 0 where it is below `min_chord`, and its tolerance.
+        Chord between the two directions, 0 where it is below `min_chord`, and its tolerance [rad].
     angle, wide : int
         Position angle of j about i, and its tolerance, in parts of `TURN`.
     """
@@ -97,8 +104,10 @@ def companion(centroids, i, j, min_chord):
 
 @borrowing_kernel
 def implied_magnitudes(problem, i, j):
-    """Return the magnitudes that the fluxes of two centroids imply, NaN while the zero point is
-    unknown, and their difference, NaN where a flux is unknown (compiled)."""
+    """Return the magnitudes that the fluxes of two centroids imply, and i's less j's (compiled).
+
+    All are NaN where a flux is unknown; the magnitudes too while the zero point is.
+    """
     instrumental, zero_point = problem.centroids.instrumental, problem.rule.zero_point
     m_i, m_j = instrumental[i] + zero_point, instrumental[j] + zero_point
     return m_i, m_j, instrumental[i] - instrumental[j]
@@ -109,10 +118,10 @@ def contradicts_brightness(magnitude, a, b, m_i, m_j, m_ij, mag_gate):
     """Return whether the brightness of two centroids contradicts two stars (compiled).
 
     magnitude : (stars,), of the catalogue [mag]. a, b : rows of the stars. m_i, m_j, m_ij : as from
-    `implied_magnitudes`. mag_gate : [mag]
+    `implied_magnitudes`. mag_gate : [mag], of one magnitude; that of a difference is wider by the
+    root of two. What is unknown (NaN) contradicts nothing.
     """
     m_a, m_b = magnitude[a], magnitude[b]
-    # Comparisons with NaN are false.
     if abs(m_a - m_b - m_ij) > 1.414 * mag_gate:
         return True
     return abs(m_a - m_i) > mag_gate or abs(m_b - m_j) > mag_gate
@@ -134,11 +143,11 @@ def count_votes(problem, i, order, min_companions, enough_votes, votes):
 
     Returns
     -------
-    companions, votes, log2 : int
-        Numbers of both, and log2 of the number of bins of roll.
+    n, n_votes, log2 : int
+        Numbers of companions and of votes, and log2 of the number of bins of roll.
     """
     centroids, pairs = problem.centroids, problem.pairs
-    n, cast, widest = 0, 0, 0
+    n, n_votes, sum_wide = 0, 0, 0
     for j in order:
         if j == i:
             continue
@@ -148,15 +157,15 @@ def count_votes(problem, i, order, min_companions, enough_votes, votes):
         lo, hi = range_of(pairs.chord, c - tolerance, c + tolerance)
         votes.companion[n], votes.low[n], votes.high[n] = j, lo, hi
         votes.angle[n], votes.wide[n] = angle, wide
-        n, cast, widest = n + 1, cast + 2 * (hi - lo), widest + wide
-        if n >= min_companions and cast > enough_votes:
+        n, n_votes, sum_wide = n + 1, n_votes + 2 * (hi - lo), sum_wide + wide
+        if n >= min_companions and n_votes > enough_votes:
             break
-    log2 = roll_bits(cast, pairs.n_stars, widest / max(n, 1))
+    log2 = roll_bits(n_votes, pairs.n_stars, sum_wide / max(n, 1))
     votes.cast[: pairs.n_stars << log2] = 0
     votes.reached[:] = 0
     for m in range(n):
         _vote(problem, i, m, log2, votes)
-    return n, cast, log2
+    return n, n_votes, log2
 
 
 @borrowing_kernel
@@ -185,7 +194,9 @@ def _cast(star, turn, wide, log2, votes):
     shift, mask = 16 - log2, (1 << log2) - 1
     for k in range((turn - wide) >> shift, ((turn + wide) >> shift) + 1):
         cell = (star << log2) + (k & mask)
-        count = votes.cast[cell] + np.uint8(1)
+        count = votes.cast[cell] + np.uint8(1)  # numba's sum has more than a byte
+        if count > MAX_CELL_VOTES:
+            continue
         votes.cast[cell] = count
         if count > 1:  # one vote is never enough
             votes.reached[count] += 1
@@ -194,16 +205,16 @@ def _cast(star, turn, wide, log2, votes):
 # Refined votes.
 
 MAX_REFINED = 1 << 13  # votes of a pivot that are counted again
-_BINS_LOG2 = 14  # a bin serves all stars and rolls with one hash: collisions only cost time
-_FINE_LOG2 = 12  # finest bins of roll, in a full turn
+_BINS_LOG2 = 14  # one bin for all stars and rolls with the same hash: collisions only cost time
+_FINE_LOG2 = 12  # of the number of the finest bins of roll, in a full turn
 
 
 class RefinedVotes(NamedTuple):
     """Votes that are counted again.
 
     star, turn, wide : (n,) int64, the pivot's star, the roll and its tolerance, in parts of `TURN`
-    pair, way, companion : (n,) int64, row of the pair table, which of its stars is the pivot's,
-        and the number of the companion
+    pair, way, companion : (n,) int64, row of the pair table, which of its stars is the pivot's
+        (0: the first), and the row of the companion in `Votes`
     bins : (bins,) int16, the votes of each bin
     """
 
@@ -270,13 +281,13 @@ def gather_votes(problem, i, n_companions, log2, votes, min_votes, refined):
 
 @borrowing_kernel
 def _bin_of(star, turn):
-    """Return the bin, 0 to 2^14 - 1, of a star and a part of a turn: a hash."""
+    """Return the bin of a star and a bin of roll: a hash, with two numbers that mix them well."""
     return (star * 40_503 + turn * 10_007) & ((1 << _BINS_LOG2) - 1)
 
 
 @borrowing_kernel
 def count_refined(n, fine, refined):
-    """Count the first n votes in bins of 2^fine parts of `TURN` (compiled)."""
+    """Count the first n votes anew, in bins of 2^fine parts of `TURN` (compiled)."""
     refined.bins[:] = 0
     for k in range(n):
         add_vote(k, fine, 1, refined)
