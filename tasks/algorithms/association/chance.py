@@ -306,7 +306,7 @@ def _may_see(views: Views, sensors: Indices, m: int, x_km: Array) -> Flags:
 def _seen_by(camera, others, x):
     """Return how many sensors of a set see each point x (n, 3) [km], and whether it is theirs.
 
-    Sensors are rows of `camera` (s, 33), and of `others` those that are not of the set. A point is
+    Sensors are rows of `camera` (s, 34), and of `others` those that are not of the set. A point is
     theirs (1, else 0) if the set and all sensors that see it are similar, see `SAME_SENSORS`.
     Result: (n, 2).
     """

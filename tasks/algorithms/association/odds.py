@@ -88,7 +88,7 @@ def seeing(r, R, half_field, x, out):
 def in_view(cam, x):
     """Return the same as `sees`, for a row of `Views.camera`.
 
-    `cam` (33,) is the sensor at an instant, `x` (3,) a point [km], GCRF.
+    `cam` (34,) is the sensor at an instant, `x` (3,) a point [km], GCRF.
     """
     d0, d1, d2 = x[0] - cam[0], x[1] - cam[1], x[2] - cam[2]
     depth = cam[TURN + 6] * d0 + cam[TURN + 7] * d1 + cam[TURN + 8] * d2
@@ -187,7 +187,7 @@ def nearest_range2(views, members, points):
 def _range2(cam, s, m, x):
     """Return the squared range [km^2] from sensor s at instant m to the point x.
 
-    `cam` (s, k, 33) is `Views.camera`, `x` (3,) [km], GCRF.
+    `cam` (s, k, 34) is `Views.camera`, `x` (3,) [km], GCRF.
     """
     d0, d1, d2 = x[0] - cam[s, m, 0], x[1] - cam[s, m, 1], x[2] - cam[s, m, 2]
     return d0 * d0 + d1 * d1 + d2 * d2

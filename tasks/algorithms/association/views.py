@@ -18,8 +18,8 @@ from epipole.tasks.algorithms.kernels import borrowing_kernel, kernel
 # reads a single row. Few arrays also compile fast.
 X, Y, XX, XY, YY, SIGMA_KM, DX, DY, HAS_RATE = range(9)
 R_KM, PLANE, TURN, HALF, CORNER, SCALE, MAX_VARIANCE, REACH = 0, 3, 12, 21, 23, 25, 27, 28
-V_KM_S, MAX_RATE = 29, 32
-N_SIGHT, N_CAMERA = 9, 33
+V_KM_S, MAX_RATE, MAX_SIGMA_KM = 29, 32, 33
+N_SIGHT, N_CAMERA = 9, 34
 
 
 class Views(NamedTuple):
@@ -33,12 +33,13 @@ class Views(NamedTuple):
         Gnomonic coordinates in the sensor's plane (X, Y), their variances and covariance (XX, XY,
         YY), the 1-sigma error of the sensor's position [km], the rates of the coordinates [1/s]
         (DX, DY), and 1 where these are known, else 0 (HAS_RATE).
-    camera : (s, k, 33) float
+    camera : (s, k, 34) float
         The sensor's position [km]; the plane's two axes and its normal; the sensor's axes (NaN
         where unknown); tangents of half its field; the grid's lowest coordinates and its cells
         per unit; the largest variance of a tracklet on the plane; the tangent of the cone about
         the normal that holds field and tracklets (0 without tracklets); the sensor's velocity
-        [km/s]; the highest rate of a coordinate among its tracklets [1/s].
+        [km/s]; among its tracklets the highest rate of a coordinate [1/s], and the largest error of
+        the position [km].
     grid : (s, k, 2) int
         First cell of a sensor and instant in `cell_start`, and the number of cells per side.
     cell_start, cell_item : (c,), (v,) int
@@ -244,7 +245,7 @@ def _reach(camera: Array, grid: Indices) -> Array:
 def _flatten(sensor, order, seen, u, cov, rate, camera, sight):
     """Project directions, rates, and covariances on `directions.tangent_basis` onto the planes.
 
-    Writes `sight` (t, k, 9), but for SIGMA_KM, and MAX_RATE of `camera` (s, k, 33). These and
+    Writes `sight` (t, k, 9), but for SIGMA_KM, and MAX_RATE of `camera` (s, k, 34). These and
     `sensor` (t,) are in the order of the search. `seen`, `u`, `cov` and `rate` are those of
     `Samples`, and `order` (t,) are their rows; `rate` is (0, k, 3) where rates are missing.
     """
@@ -296,9 +297,9 @@ def _flatten(sensor, order, seen, u, cov, rate, camera, sight):
 def _fill_grids(first, seen, sight, camera, grid, cell_start, cell_item):
     """Sort each sensor's tracklets into square cells, about one tracklet per cell.
 
-    Writes `grid`, `cell_start` and `cell_item` of `Views`, all zero before, and CORNER, SCALE and
-    MAX_VARIANCE of `camera` (s, k, 33). `first` (s + 1,), `seen` (t, k) and `sight` (t, k, 9) are
-    those of `Views`.
+    Writes `grid`, `cell_start` and `cell_item` of `Views`, all zero before, and CORNER, SCALE,
+    MAX_VARIANCE and MAX_SIGMA_KM of `camera` (s, k, 34). `first` (s + 1,), `seen` (t, k) and
+    `sight` (t, k, 9) are those of `Views`.
     """
     begin, filled = 0, 0
     cell = np.empty(seen.shape[0], np.int64)
@@ -332,6 +333,8 @@ def _fill_grids(first, seen, sight, camera, grid, cell_start, cell_item):
                 half = (sight[i, m, XX] + sight[i, m, YY]) / 2
                 apart = np.hypot((sight[i, m, XX] - sight[i, m, YY]) / 2, sight[i, m, XY])
                 camera[s, m, MAX_VARIANCE] = max(camera[s, m, MAX_VARIANCE], half + apart)
+                sigma_km = sight[i, m, SIGMA_KM]
+                camera[s, m, MAX_SIGMA_KM] = max(camera[s, m, MAX_SIGMA_KM], sigma_km)
             cell_start[begin] = filled
             for q in range(side * side):
                 cell_start[begin + q + 1] += cell_start[begin + q]

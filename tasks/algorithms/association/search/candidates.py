@@ -16,6 +16,7 @@ from epipole.tasks.algorithms.association.views import (
     DY,
     HAS_RATE,
     MAX_RATE,
+    MAX_SIGMA_KM,
     MAX_VARIANCE,
     PLANE,
     SIGMA_KM,
@@ -133,12 +134,11 @@ def _gate(views, s, m, predicted, gate_sigma):
     """Return the maximum distance of a tracklet from the prediction, along both coordinates.
 
     They are those of the plane of sensor s at instant m; `predicted` (k, 10) is of `_predict`. The
-    error of the directions is the largest of the sensor's tracklets, that of its position the one
-    of its first tracklet.
+    errors of direction and position are the largest of the sensor's tracklets there.
     """
     cam = views.camera
     gate = np.sqrt(quantile(2, gate_sigma))
-    position_error = views.sight[views.first[s], m, SIGMA_KM] / predicted[m, DEPTH]
+    position_error = cam[s, m, MAX_SIGMA_KM] / predicted[m, DEPTH]
     errors = (cam[s, m, MAX_VARIANCE] + position_error * position_error) * predicted[m, STRETCH]
     drift = abs(predicted[m, EXTRA_LIGHT]) * cam[s, m, MAX_RATE]
     reach0 = gate * np.sqrt(predicted[m, H00] + errors) + abs(predicted[m, MOTION0]) + drift

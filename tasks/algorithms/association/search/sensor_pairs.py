@@ -263,7 +263,7 @@ def _passing(views, sparse, farthest_km):
 def _pass_near(camera_a, u_a, camera_b, u_b, rad, km, farthest_km):
     """Return whether two lines of sight pass within some angle and distance, above the ground.
 
-    Nearly parallel lines always do; nearly opposite ones never. `camera_a` and `camera_b` (33,) are
+    Nearly parallel lines always do; nearly opposite ones never. `camera_a` and `camera_b` (34,) are
     rows of `Views.camera`, of which the positions are read [km]; `u_a` and `u_b` (3,) are unit
     vectors, ICRS. `rad` [rad] and `km` [km] together limit the gap.
     """

@@ -12,6 +12,7 @@ from scenes.ten_tracklets import (
     points_of,
     range_km,
     residual,
+    scene_of,
     ten_tracklets,
 )
 
@@ -76,6 +77,32 @@ def test_the_best_and_the_second_best_are_those_of_all_tracklets(seed, options):
             assert gain == pytest.approx(gains[0][0], abs=2e-3)
             assert second == pytest.approx(gains[1][0], abs=2e-3)
         scene.space.taken[:] = False
+
+
+def test_a_sensor_whose_position_is_vague_loses_no_tracklet():
+    """Where a tracklet is not seen, its samples have another position error than where it is."""
+    compared = 0
+    for seed in range(20):
+        options = {"n_objects": 3, "spread_km": 60.0, "times": (0.0, 20.0, 40.0), "seen": 0.6}
+        exact = ten_tracklets(seed, n_sensors=4, n_strays=0, sigma_km=0.05, **options)
+        samples = exact.samples
+        vague_km = np.where(samples.seen, 30.0, 1.0)
+        sigma_km = np.where(samples.sensor[:, None] == 3, vague_km, samples.sigma_km)
+        samples = samples._replace(sigma_km=sigma_km)
+        scene = scene_of(samples, exact.who, np.random.default_rng(seed))
+        for k in range(3):
+            views = [i for i in np.flatnonzero(scene.who == k) if samples.sensor[i] < 3]
+            solved = points_of(samples, views)
+            if solved is None or not solved[0]:
+                continue
+            enter(scene.work, samples, views, solved[0])
+            of_sensor = np.flatnonzero(samples.sensor == 3)
+            gains = [(gain_of(scene, c, solved[0]), c) for c in of_sensor]
+            gain, want = max(gains, default=(-np.inf, -1))
+            found = _best_of_sensor(scene.space, scene.work, 3, np.zeros(0, np.int64), -5.0)
+            assert found[0] == (want if gain > -5.0 else -1)
+            compared += 1
+    assert compared > 50
 
 
 @pytest.mark.parametrize("options", SCENES)
