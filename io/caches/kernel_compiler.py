@@ -112,9 +112,10 @@ def _count() -> int | None:
     folder, count = kernel_folder(), 0
     if folder is None:
         return None
-    for module in folder.glob("*"):
-        with contextlib.suppress(FileNotFoundError):  # another run has just removed it
-            count += sum(1 for _ in module.glob("*.nbi"))
+    for module in os.listdir(folder) if folder.is_dir() else ():
+        # Another run may just have removed it, or it is a file that is not of this program.
+        with contextlib.suppress(FileNotFoundError, NotADirectoryError):
+            count += sum(name.endswith(".nbi") for name in os.listdir(folder / module))
     return count
 
 

@@ -6,6 +6,7 @@ import pyarrow as pa
 from epipole.schemas.arrays import Array, Flags, Indices
 from epipole.schemas.bridge import table
 from epipole.schemas.tables import ASSOCIATIONS, PAIRS
+from epipole.tasks.algorithms.geometry.covariances import traces
 from epipole.tasks.algorithms.geometry.directions import lengths
 from epipole.tasks.algorithms.geometry.epipolar import (
     UncertainSight,
@@ -68,7 +69,7 @@ def _seen_together(groups: ViewGroups) -> Array:
 def _position_error(groups: ViewGroups) -> Array:
     """Return the square of the error that each view alone leaves at the object [km^2]."""
     views = groups.views
-    across = np.trace(views.cov, axis1=1, axis2=2) / 2
+    across = traces(views.cov) / 2
     range_km = lengths(groups.x_km[groups.group] - views.r_km)
     return across * range_km**2 + views.sigma_km**2
 

@@ -10,6 +10,7 @@ from epipole.schemas.rejects import Reason, reject_rows
 from epipole.schemas.spans import Span
 from epipole.schemas.tables import POSITIONS, REJECTS
 from epipole.tasks.algorithms.constants import SPEED_OF_LIGHT_KM_S
+from epipole.tasks.algorithms.geometry.covariances import traces
 from epipole.tasks.algorithms.geometry.directions import lengths
 from epipole.tasks.algorithms.geometry.triangulation import triangulate
 from epipole.tasks.algorithms.orbits.object_motion import (
@@ -61,7 +62,7 @@ def _solve(views: ObjectViews, reject_sigma: float) -> ViewGroups:
         )
         velocity, spread_s = _velocities(epoch_ns, number, x_km)
         if not last:
-            sigma = np.sqrt(np.trace(cov_km2, axis1=1, axis2=2) / 3)
+            sigma = np.sqrt(traces(cov_km2) / 3)
             state = np.hstack([x_km, velocity])[group]
             views = with_neglected_motion(views, state, sigma[group], spread_s[group])
     return ViewGroups(

@@ -26,6 +26,7 @@ from epipole.tasks.algorithms.geometry.covariances import (
     in_components,
     scatter_beyond,
     shared_direction_covariance,
+    traces,
 )
 from epipole.tasks.algorithms.geometry.directions import (
     aberrate,
@@ -86,12 +87,17 @@ class TrackletSightings(NamedTuple):
 
 
 class SensorSightings(NamedTuple):
-    """The sightings of one sensor, its frames and its optics."""
+    """The sightings of one sensor, its frames and its optics.
+
+    `magnitude` and `magnitude_sigma` (n,) are of the sightings, NaN where unknown.
+    """
 
     frames: Frames
     tracklets: TrackletSightings
     camera: Camera
     cov_optics: Array
+    magnitude: Array
+    magnitude_sigma: Array
 
 
 def sight_objects(
@@ -125,7 +131,17 @@ def sight_objects(
     tracklets = _with_trails(tracklets, frames)
     tracklets = _with_image_trails(tracklets, frames, half_width_s)
     tracklets = _with_blends(tracklets, frames, camera)
-    return SensorSightings(frames, tracklets, camera, optics_covariance_of(cameras, row))
+    cov_optics = optics_covariance_of(cameras, row)
+    return SensorSightings(frames, tracklets, camera, cov_optics, *_magnitudes(frames, tracklets))
+
+
+def _magnitudes(frames: Frames, tracklets: TrackletSightings) -> tuple[Array, Array]:
+    """Return the magnitude of each sighting and its 1-sigma error; NaN where unknown."""
+    of_frames = (
+        array(frames.table, name).astype(float)[tracklets.frame]
+        for name in ("zero_mag", "zero_variance_mag2", "flux_floor_mag2", "flux_photon_mag2")
+    )
+    return FluxScale(*of_frames).magnitudes(tracklets.flux)
 
 
 class OpticsCovariances(NamedTuple):
@@ -191,7 +207,7 @@ def _by_tracklet(frames: Frames, tracked: pa.Table, cameras: pa.Table) -> Trackl
     order = np.lexsort((sightings.frame, rank))
     bounds = group_offsets(rank[order])
     centroid_rad2 = (array(tracked, "sigma_arcsec")[sightings.row] * ARCSEC) ** 2
-    turn_rad2 = np.trace(sightings.cov_noise, axis1=1, axis2=2) / 2 - centroid_rad2
+    turn_rad2 = traces(sightings.cov_noise) / 2 - centroid_rad2
     return TrackletSightings(
         sightings.frame[order],
         sightings.time_ns[order],
@@ -255,7 +271,7 @@ def _with_split_prior(
     tracklet = tracklets.tracklet[prior]
     follows = np.append(False, (np.diff(tracklet) == 0) & (np.diff(prior) == 1))
     scatter = scatter_beyond(about.miss, np.sqrt(about.noise_rad2), about.leverage, follows)
-    stated = np.trace(tracklets.cov_bias, axis1=1, axis2=2)[prior] / 2
+    stated = traces(tracklets.cov_bias)[prior] / 2
     share = scatter / np.maximum(stated, 1e-30)
     n_frames = len(np.unique(tracklets.frame[prior]))
     stays = np.maximum(1.0 - share, share / np.sqrt(n_frames))
@@ -293,8 +309,8 @@ def _about_motion(
         tracklets.bounds[tracklet], tracklets.bounds[tracklet + 1], time_s[rows], 0.0, time_s, u,
         tracklets.cov_noise, tracklets.cov_bias, half_width_s,
     )  # fmt: skip
-    noise_rad2 = np.trace(tracklets.cov_noise, axis1=1, axis2=2)[rows] / 2
-    leverage = (np.trace(fit.cov_noise, axis1=1, axis2=2) / 2 - fit.unmodelled) / noise_rad2
+    noise_rad2 = traces(tracklets.cov_noise)[rows] / 2
+    leverage = (traces(fit.cov_noise) / 2 - fit.unmodelled) / noise_rad2
     return _AboutMotion(u[rows] - fit.u, fit.w, noise_rad2, leverage)
 
 
@@ -364,7 +380,6 @@ def tabulate_sightings(sightings: SensorSightings | None) -> pa.Table:
     noise = _on_sky(u, _noise(sightings, u))
     sigma = np.sqrt(np.diagonal(noise, axis1=1, axis2=2))
     r_km, v_km_s = _states_at_rows(frames, tracklets)
-    magnitude, magnitude_sigma = magnitudes(sightings)
     columns = {
         "time": tracklets.time_ns,
         "sensor_id": array(frames.table, "sensor_id")[frame],
@@ -384,8 +399,8 @@ def tabulate_sightings(sightings: SensorSightings | None) -> pa.Table:
     kept = np.flatnonzero(np.isfinite(r_km[:, 0]))
     kept = kept[np.argsort(tracklets.time_ns[kept], kind="stable")]
     maybe = {
-        "magnitude": magnitude,
-        "magnitude_sigma": magnitude_sigma,
+        "magnitude": sightings.magnitude,
+        "magnitude_sigma": sightings.magnitude_sigma,
         **unstack("v{}_km_s", v_km_s),
     }
     return table(
@@ -416,7 +431,7 @@ def _bias_sigma(sightings: SensorSightings, rows: Indices) -> Array:
     R = matrix_from_quaternion(frames.q_sensor_from_icrs[frame])
     u_sensor = np.einsum("nij,nj->ni", R, u_icrs)
     shared = tracklets.cov_bias[rows] + optics_covariance(sightings, R, u_sensor, frame).whole
-    trace = np.trace(shared, axis1=1, axis2=2) - 2 * tracklets.blend_rad2[rows]
+    trace = traces(shared) - 2 * tracklets.blend_rad2[rows]
     return np.sqrt(np.maximum(trace / 2, 0.0))
 
 
@@ -487,7 +502,7 @@ def _nearest(time_ns: Indices, bounds: Indices, number: Indices, at_ns: Indices)
 def _mean_magnitudes(sightings: SensorSightings, number: Indices) -> dict[str, Array]:
     """Return the mean magnitudes of tracklets, their errors and scatter; NaN where unknown."""
     tracklets = sightings.tracklets
-    magnitude, sigma = magnitudes(sightings)
+    magnitude, sigma = sightings.magnitude, sightings.magnitude_sigma
     known, n = np.isfinite(magnitude) & (sigma > 0), len(tracklets.name)
     weight = np.where(known, 1 / np.where(known, sigma, 1.0) ** 2, 0.0)
     value = np.where(known, magnitude, 0.0)
@@ -527,13 +542,3 @@ def states_near_frames(frames: Frames, served: Indices, dt_s: Array) -> tuple[Ar
 def _on_sky(u: Array, cov: Array) -> Array:
     """Return (n, 3, 3) covariances as (n, 2, 2), east and north."""
     return in_components(east_north(u), cov)
-
-
-def magnitudes(sightings: SensorSightings) -> tuple[Array, Array]:
-    """Return the magnitude of each sighting and its 1-sigma error; NaN where unknown."""
-    frames, tracklets = sightings.frames, sightings.tracklets
-    of_frames = (
-        array(frames.table, name).astype(float)[tracklets.frame]
-        for name in ("zero_mag", "zero_variance_mag2", "flux_floor_mag2", "flux_photon_mag2")
-    )
-    return FluxScale(*of_frames).magnitudes(tracklets.flux)

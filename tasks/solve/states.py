@@ -16,6 +16,7 @@ from epipole.schemas.rejects import Reason, reject_rows
 from epipole.schemas.settings import StateSettings
 from epipole.schemas.tables import STATES
 from epipole.schemas.work_tables import SHARED_ERRORS
+from epipole.tasks.algorithms.geometry.covariances import traces
 from epipole.tasks.algorithms.orbits.object_motion import velocities
 from epipole.tasks.algorithms.orbits.orbit_fit import (
     Arcs,
@@ -59,7 +60,7 @@ def judge_errors(groups: ViewGroups, settings: StateSettings) -> pa.Table:
     arcs, sensor_ids = named.arcs, named.sensor_ids
     fitted = fit_orbits(arcs, _starts(groups, named))
     prior = prior_information(arcs, slice(None), arcs.sensor, len(sensor_ids))
-    has_bias = np.bincount(arcs.sensor, np.trace(arcs.cov_bias, axis1=1, axis2=2)) > 0.0
+    has_bias = np.bincount(arcs.sensor, traces(arcs.cov_bias)) > 0.0
     free = np.column_stack([has_bias, np.ones(len(sensor_ids), bool)])
     equations = _unmixed_arcs(fitted, np.diff(arcs.offsets))
     factor = scale_shared_errors(equations, prior, free)

@@ -35,7 +35,7 @@ from epipole.schemas.work_tables import (
     VIEWS,
 )
 from epipole.tasks.algorithms.geometry.camera import Camera, project
-from epipole.tasks.algorithms.geometry.covariances import on_tangent_plane
+from epipole.tasks.algorithms.geometry.covariances import on_tangent_plane, traces
 from epipole.tasks.algorithms.geometry.directions import (
     aberrate,
     interpolate_quaternions,
@@ -56,7 +56,6 @@ from epipole.tasks.solve.align_epochs import EpochGrid, align_epochs
 from epipole.tasks.solve.sightings import (
     SensorSightings,
     TrackletSightings,
-    magnitudes,
     optics_covariance,
     sight_objects,
     states_near_frames,
@@ -144,11 +143,11 @@ def _view_table(
     r_km, v_km_s = states_near_frames(frames, frame, array(epochs, "dt_s")[row])
     cov_noise, cov_bias = (on_tangent_plane(u, cov) for cov in motion[2:4])
     cov_noise, cov_bias, blend_rad2 = _without_blends(tracklet, cov_noise, cov_bias)
-    turn = np.where(frames.from_stars[frame], 0.0, np.trace(cov_bias, axis1=1, axis2=2))
+    turn = np.where(frames.from_stars[frame], 0.0, traces(cov_bias))
     if sightings.cov_optics.any():
         by_optics = optics_covariance(sightings, R, u_sensor, frame)
         cov_bias = cov_bias + on_tangent_plane(u, by_optics.whole)
-        turn += np.trace(by_optics.turn, axis1=1, axis2=2)
+        turn += traces(by_optics.turn)
     kept = np.isfinite(x_px) & np.isfinite(r_km[:, 0])
     columns = {
         "epoch": array(epochs, "epoch")[row],
@@ -212,13 +211,13 @@ def _turn_noise(tracklets: TrackletSightings, fitted: Indices, cov_noise: Array)
     It is as in the middle one of the detections that each view is fitted to.
     """
     middle = (fitted[:, 0] + fitted[:, 1] - 1) // 2
-    whole = np.trace(tracklets.cov_noise[middle], axis1=1, axis2=2)
-    return tracklets.turn_rad2[middle] / whole * np.trace(cov_noise, axis1=1, axis2=2)
+    whole = traces(tracklets.cov_noise[middle])
+    return tracklets.turn_rad2[middle] / whole * traces(cov_noise)
 
 
 def _fitted_magnitudes(sightings: SensorSightings, fitted: Indices) -> Array:
     """Return the mean magnitude of ranges of detections, (n, 2), without blended ones; else NaN."""
-    magnitude, _ = magnitudes(sightings)
+    magnitude = sightings.magnitude
     known = np.isfinite(magnitude) & (sightings.tracklets.blend_rad2 == 0.0)
     before = np.zeros((len(known) + 1, 2))
     np.cumsum(np.stack([known, np.where(known, magnitude, 0.0)], axis=1), axis=0, out=before[1:])
@@ -234,12 +233,12 @@ def _without_blends(
     All views of a tracklet share the smallest bias among them. Blends add more to some of them:
     this part is not shared, and so becomes noise.
     """
-    shared = np.trace(cov_bias, axis1=1, axis2=2)
+    shared = traces(cov_bias)
     minimum = np.full(int(tracklet.max(initial=-1)) + 1, np.inf)
     np.minimum.at(minimum, tracklet, shared)
     stays = (minimum[tracklet] / np.where(shared > 0.0, shared, np.inf))[:, None, None]
     more = (1 - stays) * cov_bias
-    return cov_noise + more, stays * cov_bias, np.trace(more, axis1=1, axis2=2) / 2
+    return cov_noise + more, stays * cov_bias, traces(more) / 2
 
 
 def _field_parts(camera: Camera, x_px: Array, y_px: Array) -> npt.NDArray[np.int8]:

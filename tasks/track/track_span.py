@@ -31,6 +31,7 @@ from epipole.schemas.tables import DETECTIONS, STARS
 from epipole.schemas.work_tables import HOT_SUSPECTS, SOLUTIONS, TRACKLET_RUNS
 from epipole.tasks.algorithms.constants import ARCSEC
 from epipole.tasks.algorithms.geometry.camera import Camera
+from epipole.tasks.algorithms.geometry.covariances import traces
 from epipole.tasks.algorithms.geometry.directions import lengths
 from epipole.tasks.algorithms.times import frame_interval_ns
 from epipole.tasks.algorithms.tracking.hot_pixels import CERTAIN, LIKELY, NOWHERE
@@ -118,7 +119,7 @@ def measure_runs(
     bias = np.take(sightings.cov_bias, order, axis=0)
     smooth, *_ = directions_at(first, last, t, 0.0, t, u, noise, bias, window_s)
     miss = lengths(u - smooth)
-    variance = np.trace(noise, axis1=1, axis2=2)
+    variance = traces(noise)
     runs = []
     for lo, hi in itertools.pairwise(bounds):
         members = order[lo:hi]

@@ -115,6 +115,14 @@ def _transform(basis, cov, out):
                 out[i, a, b] = x * B[b, 0] + y * B[b, 1] + z * B[b, 2]
 
 
+def traces(cov: Array) -> Array:
+    """Return the traces (n,) of matrices (n, k, k).
+
+    `numpy.trace` takes five times as long for small ones.
+    """
+    return np.einsum("nii->n", cov)
+
+
 def scatter_beyond(residual_rad: Array, sigma_rad: Array, leverage: Array, follows: Flags) -> float:
     """Return the variance of directions, per axis, in excess of their stated one [rad^2].
 
@@ -317,5 +325,5 @@ def _levers(turns: Array, u: Array, sigma_rad: Array, starts: Indices) -> Array:
     weight = 1.0 / np.square(sigma_rad)
     across = np.eye(3) - u[:, :, None] * u[:, None, :]
     A = np.add.reduceat(weight[:, None, None] * across, starts)
-    A += 1e-9 * np.trace(A, axis1=1, axis2=2)[:, None, None] * np.eye(3)  # if all are equal
+    A += 1e-9 * traces(A)[:, None, None] * np.eye(3)  # if all are equal
     return np.linalg.solve(A, np.add.reduceat(weight[:, None, None] * turns, starts))

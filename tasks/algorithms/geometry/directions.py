@@ -150,7 +150,8 @@ def _interpolate(q, row, share, out):
 
 def unit_from_radec(ra: Array, dec: Array) -> Array:
     """Return (..., 3) unit vectors of right ascensions and declinations [rad]."""
-    return np.stack([np.cos(dec) * np.cos(ra), np.cos(dec) * np.sin(ra), np.sin(dec)], axis=-1)
+    level = np.cos(dec)
+    return np.stack([level * np.cos(ra), level * np.sin(ra), np.sin(dec)], axis=-1)
 
 
 def radec_from_unit(u: Array) -> tuple[Array, Array]:

@@ -12,6 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from epipole.schemas.arrays import Array, Flags, Indices
+from epipole.tasks.algorithms.geometry.covariances import traces
 from epipole.tasks.algorithms.kernels import kernel
 from epipole.tasks.algorithms.tracking.local_motion import directions_at
 from epipole.tasks.algorithms.tracking.sky_filter import BEND_SHARE, acceleration
@@ -141,7 +142,7 @@ def _ends_of(tracked: TrackedDetections) -> _TrackletEnds:
         t, tracked.u_icrs, tracked.cov_noise, np.zeros_like(tracked.cov_noise), MAX_PREDICTED_S / 2,
     )  # fmt: skip
     fitted_s = np.clip(time[:, 1] - time[:, 0], 1e-3, MAX_PREDICTED_S / 2)
-    variance = np.trace(fit.cov_noise, axis1=1, axis2=2).reshape(-1, 2) / 2
+    variance = traces(fit.cov_noise).reshape(-1, 2) / 2
     flux = np.full(len(first), np.nan)
     return _TrackletEnds(
         time, fit.u.reshape(-1, 2, 3), fit.w.reshape(-1, 2, 3), variance, fitted_s, flux

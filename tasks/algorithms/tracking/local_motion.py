@@ -10,6 +10,7 @@ from typing import NamedTuple
 import numpy as np
 
 from epipole.schemas.arrays import Array, Integers
+from epipole.tasks.algorithms.geometry.covariances import traces
 from epipole.tasks.algorithms.geometry.directions import lengths
 from epipole.tasks.algorithms.kernels import kernel
 from epipole.tasks.algorithms.symmetric_matrices import invert_symmetric
@@ -314,7 +315,7 @@ def directions_at(
     )
     detections = _MotionDetections(
         *(np.ascontiguousarray(a, float) for a in (time_s, u_icrs, cov_noise, cov_bias)),
-        *(np.trace(cov, axis1=1, axis2=2) for cov in (cov_noise, cov_bias)),
+        *(traces(cov) for cov in (cov_noise, cov_bias)),
     )
     fits = _MotionFits(
         np.empty((q, 3)), np.empty((q, 3)), np.empty((q, 3, 3)), np.empty((q, 3, 3)),
