@@ -4,8 +4,8 @@ For each seed, `grow_all` goes through these steps (2 to 5 are `_grow`):
 
 1. The sensors that share space with both sensors of the seed are looked up.
 2. The seed's points are solved, and the sensors that may see them are listed (`_begin`).
-3. Sensor after sensor, the tracklet that adds most to the odds joins (`_join_sensor`). The seed is
-   given up as soon as the other sensors make it improbable.
+3. Sensor after sensor, the tracklet that adds most to the odds joins (`_join_others`). The seed is
+   given up as soon as the other sensors make it improbable. Those of the seed come last.
 4. Members that do not fit are dropped, the worst first (`_settle`).
 5. The first members were chosen with inaccurate points: they are chosen again (`_review`).
 6. The hypothesis is scored, and taken at once if it is clear (`_is_clear`).
@@ -137,68 +137,80 @@ def grow_all(space, work, seeds, clear, min_score):
 def _grow(space, work, members, nearby):
     """Grow the first two members; return the size and the number of sensors in `work.near`.
 
-    Sensor after sensor, the tracklet that adds most to the odds joins, and a miss lowers them. The
-    hypothesis is given up, with size 0, as soon as the log-odds of the other sensors are below
-    `GIVE_UP_LOG_ODDS` (Wald's sequential test). The sensors of the seed come last: they may have
-    another fragment of the object. `members` (t + 2,) is changed in place; `nearby` (n,) are the
-    sensors that share space with those of the seed, in order.
+    The size is 0 if the seed is given up. `members` (t + 2,) is changed in place; `nearby` (n,) are
+    the sensors that share space with those of the seed, in order.
     """
-    views, near = space.views, work.near
-    n = np.int64(2)  # for numba a literal 2 has another type: all would be compiled twice
-    n_near = _begin(space, work, members[:n], nearby)
-    if n_near < 0:
+    sensor = space.views.sensor
+    seed_sensors = sensor[members[0]], sensor[members[1]]
+    n, n_near, n_early = _join_others(space, work, members, nearby)
+    if n < 2:
         return np.int64(0), np.int64(0)
-    a, b = views.sensor[members[0]], views.sensor[members[1]]
-    evidence, looked = 0.0, 0  # log-odds by the other sensors, and how many should detect it
-    early = np.int64(0)  # members that were chosen before the points were well known
-    nearest2 = nearest_range2(views, members[:n], work.points)
-    begin, mark = np.searchsorted(near[:n_near], a), next_mark(work.stamp)
-    work.stamp[a] = work.stamp[b] = mark  # as all sensors that had their turn
-    turn = -1
-    while turn < n_near + 1:
-        turn += 1
-        all_looked = turn == n_near and n > 2
-        if all_looked and _has_unsolved_instant(views, members[:n], work.points.seen_by):
-            # With more points, other sensors may be near: those that had no turn get one.
-            n = _settle(space, work, members, n)
-            if n < 2:
-                return np.int64(0), np.int64(0)
-            n_near, turn = np.int64(near_fields(views, work.points, nearby, near)), -1
-            continue
-        s = _sensor_of_turn(near[:n_near], begin, turn, a, b)
-        if turn < n_near and work.stamp[s] == mark:
-            continue
-        work.stamp[s] = mark
+    for s in seed_sensors:  # they may have another fragment of the object
         before = n
-        n, evidence, detected = _join_sensor(space, work, s, members, n, evidence)
+        n, _, _ = _join_sensor(space, work, s, members, n, 0.0)
         if n < 0:
             return np.int64(0), np.int64(0)
         if n > before and before < WELL_KNOWN:
-            early = min(n, np.int64(WELL_KNOWN))
-            nearest2 = nearest_range2(views, members[:n], work.points)
-        elif n > before:  # the points hardly move
-            nearest2 = min(nearest2, nearest_range2(views, members[before:n], work.points))
-        if turn < n_near:
-            expected = detected or should_detect(views, s, work.points, nearest2)
-            looked += expected
-            if expected and not detected:
-                evidence += np.log(1.0 - space.chance.detected[s])
-            if looked >= MIN_LOOKS and evidence < GIVE_UP_LOG_ODDS:
-                return np.int64(0), np.int64(0)
+            n_early = min(n, np.int64(WELL_KNOWN))
     if n < 2 * WELL_KNOWN:
         n = _settle(space, work, members, n)
     for _ in range(REVIEWS if n < 2 * WELL_KNOWN else 1):
         if n >= MIN_REVIEWED:
-            n = _review(space, work, members, n, early)
+            n = _review(space, work, members, n, n_early)
     return n, n_near
 
 
 @borrowing_kernel
-def _sensor_of_turn(near, begin, turn, a, b):
-    """Return the sensor of a turn: those of `near` (n,), from row `begin` on, then a, then b."""
-    if turn < len(near):
-        return near[(begin + turn) % len(near)]
-    return a if turn == len(near) else b
+def _join_others(space, work, members, nearby):
+    """Give each sensor near the seed's points a turn, but not the two sensors of the seed.
+
+    The tracklets of a sensor that add most to the odds join, and a miss lowers them. The seed is
+    given up as soon as these log-odds are below `GIVE_UP_LOG_ODDS` (Wald's sequential test). The
+    turns begin at the first sensor of the seed, and go round.
+
+    Returns the size, 0 if the seed is given up; the number of sensors in `work.near`; and the
+    number of early members, which joined before the points were well known. Arguments as in
+    `_grow`.
+    """
+    views, near, had_turn = space.views, work.near, next_mark(work.stamp)
+    n = np.int64(2)  # for numba a literal 2 has another type: all would be compiled twice
+    n_early = np.int64(0)
+    n_near = _begin(space, work, members[:n], nearby)
+    if n_near < 0:
+        return np.int64(0), n_near, n_early
+    a, b = views.sensor[members[0]], views.sensor[members[1]]
+    work.stamp[a] = work.stamp[b] = had_turn
+    first = np.searchsorted(near[:n_near], a)
+    evidence, n_looked = 0.0, 0  # log-odds that the sensors add, and how many should detect it
+    nearest2 = nearest_range2(views, members[:n], work.points)
+    while True:
+        for turn in range(n_near):
+            s = near[(first + turn) % n_near]
+            if work.stamp[s] == had_turn:
+                continue
+            work.stamp[s] = had_turn
+            before = n
+            n, evidence, detected = _join_sensor(space, work, s, members, n, evidence)
+            if n < 0:
+                return np.int64(0), n_near, n_early
+            if n > before and before < WELL_KNOWN:
+                n_early = min(n, np.int64(WELL_KNOWN))
+                nearest2 = nearest_range2(views, members[:n], work.points)
+            elif n > before:  # the points hardly move
+                nearest2 = min(nearest2, nearest_range2(views, members[before:n], work.points))
+            expected = detected or should_detect(views, s, work.points, nearest2)
+            n_looked += expected
+            if expected and not detected:
+                evidence += np.log(1.0 - space.chance.detected[s])
+            if n_looked >= MIN_LOOKS and evidence < GIVE_UP_LOG_ODDS:
+                return np.int64(0), n_near, n_early
+        if n == 2 or not _has_unsolved_instant(views, members[:n], work.points.seen_by):
+            return n, n_near, n_early
+        # With more points, other sensors may be near: those that had no turn get one.
+        n = _settle(space, work, members, n)
+        if n < 2:
+            return n, n_near, n_early
+        n_near = np.int64(near_fields(views, work.points, nearby, near))
 
 
 @borrowing_kernel
@@ -306,8 +318,8 @@ def _settle(space, work, members, n):
 
 
 @borrowing_kernel
-def _review(space, work, members, n, early):
-    """Choose the members of the first `early` ones' sensors again; return the size.
+def _review(space, work, members, n, n_early):
+    """Choose the members of the sensors of the first `n_early` again; return the size.
 
     Changes `members` (t + 2,), of which the first n count. The early ones were chosen with points
     from few views; now the points are well known. A false member does more harm than a miss. So a
@@ -315,29 +327,16 @@ def _review(space, work, members, n, early):
     `MIN_LEAD` if that one adds as much. All other members stay if they still fit. If fewer than
     `MIN_REVIEWED` - 1 are left, nothing is changed.
     """
-    views, stamp, early = space.views, work.stamp, min(early, n)
-    mark = next_mark(stamp)
-    # The sensors of the early members are sorted into `work.missed`, which is free here.
-    n_again = 0
-    for i in members[:early]:
-        s = views.sensor[i]
-        if stamp[s] != mark:
-            stamp[s] = mark
-            slot = n_again
-            while slot > 0 and work.missed[slot - 1] > s:
-                work.missed[slot] = work.missed[slot - 1]
-                slot -= 1
-            work.missed[slot] = s
-            n_again += 1
-    before = work.before
+    views, before, reviewed = space.views, work.before, next_mark(work.stamp)
+    n_reviewed = _list_sensors(views, work, members[: min(n_early, n)], reviewed)
     for q in range(n):
         before[q] = members[q]
     kept = np.int64(0)
     for i in before[:n]:
-        if stamp[views.sensor[i]] != mark and _still_fits(space, work, i):
+        if work.stamp[views.sensor[i]] != reviewed and _still_fits(space, work, i):
             members[kept] = i
             kept += 1
-    for s in work.missed[:n_again]:
+    for s in work.reviewed[:n_reviewed]:
         n_same = 0
         while kept < len(members):
             c, gain, second = best_of_sensor(space, work, s, work.same_sensor[:n_same], MIN_GAIN)
@@ -353,6 +352,27 @@ def _review(space, work, members, n, early):
         for q in range(n):
             members[q] = before[q]
     return _settle(space, work, members, kept)
+
+
+@borrowing_kernel
+def _list_sensors(views, work, members, mark):
+    """Write the sensors of `members` (n,), in increasing order, to `work.reviewed`.
+
+    Returns their number. Each gets the `mark` in `work.stamp`.
+    """
+    listed, stamp, n = work.reviewed, work.stamp, 0
+    for i in members:
+        s = views.sensor[i]
+        if stamp[s] == mark:
+            continue
+        stamp[s] = mark
+        slot = n
+        while slot > 0 and listed[slot - 1] > s:
+            listed[slot] = listed[slot - 1]
+            slot -= 1
+        listed[slot] = s
+        n += 1
+    return n
 
 
 @borrowing_kernel

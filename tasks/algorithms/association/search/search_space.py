@@ -57,6 +57,8 @@ class WorkSpace(NamedTuple):
     nearby, near, missed : (s,) int
         Lists of sensors: those that share space with two sensors, of these the ones whose field
         may hold the points, and of these the ones that miss the object. The first ones count.
+    reviewed : (s,) int
+        Sensors whose members are chosen again, see `growth`. The first ones count.
     stamp : (s + 1,) int
         Which sensors are in a list, by the number of the list; the last one counts the lists.
     same_sensor : (c,) int
@@ -71,6 +73,7 @@ class WorkSpace(NamedTuple):
     nearby: Indices
     near: Indices
     missed: Indices
+    reviewed: Indices
     stamp: Indices
     same_sensor: Indices
     members: Indices
@@ -90,6 +93,7 @@ def work_space(views: Views) -> WorkSpace:
         nearby=np.empty(n_sensors, np.int64),
         near=np.empty(n_sensors, np.int64),
         missed=np.empty(n_sensors, np.int64),
+        reviewed=np.empty(n_sensors, np.int64),
         stamp=np.zeros(n_sensors + 1, np.int64),
         same_sensor=np.empty(int(np.diff(views.first).max(initial=0)) + 1, np.int64),
         members=np.empty(n + 2, np.int64),
