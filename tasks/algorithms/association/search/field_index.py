@@ -4,6 +4,11 @@ Space is divided into cells whose size grows with the distance from the Earth. E
 cone; it is entered in all cells that it touches at any instant. Two fields can overlap only
 where they share a cell, so the cost grows with the sensors per cell, not with all pairs.
 
+The cells are cubes of one size in a map of space, the grid. Directions from the Earth's centre are
+the same in both. A distance of r Earth radii is ln(r) + 1 in the grid; inside the Earth it is r.
+Cones and balls have lengths in km. `_cells_per_km` gives their lengths in the grid, over the size
+of a cell; `_centre_of` leads back from a cell to space.
+
 1. `cones_of` gives the cone about each field.
 2. `field_index` enters the cones in cells, whose size it doubles until they fit.
 3. `near_points` looks up the sensors that may see the points of a hypothesis, `sensors_sharing`
@@ -95,12 +100,31 @@ def _slot(keys, key):
 def _cells_per_km(radius_km, size):
     """Return the number of cells per kilometre at a distance from the Earth's centre.
 
-    In the grid of cells, the distance r, in Earth radii, becomes 1 + ln(r) outside the Earth and
-    stays r inside. Lengths across the radius scale by (1 + ln(r)) / r, along it by 1 / r, which is
-    less: the larger factor is returned.
+    At r Earth radii, the grid has lengths across the radius (1 + ln(r)) / r times as long as space,
+    along it 1 / r, which is less: the larger factor is returned. It also leads from a position to
+    that in the grid, in cells.
     """
     r = radius_km / EARTH_RADIUS_KM
     return ((1.0 + np.log(r)) / r if r > 1.0 else 1.0) / (EARTH_RADIUS_KM * size)
+
+
+@borrowing_kernel
+def _centre_of(i, j, k, size):
+    """Return the centre [km, GCRF] of the cell (i, j, k) of this size, and its distance from the
+    Earth's centre, in Earth radii."""
+    y0, y1, y2 = (i + 0.5) * size, (j + 0.5) * size, (k + 0.5) * size
+    in_grid = max(np.sqrt(y0 * y0 + y1 * y1 + y2 * y2), 1e-9)
+    r = np.exp(in_grid - 1.0) if in_grid > 1.0 else in_grid
+    scale = EARTH_RADIUS_KM * r / in_grid
+    return y0 * scale, y1 * scale, y2 * scale, r
+
+
+@borrowing_kernel
+def _half_diagonal_km(r, size):
+    """Return half the diagonal [km] of a cell whose centre is r Earth radii from the Earth's."""
+    in_grid = 0.5 * np.sqrt(3.0) * size
+    # A cell is larger on its far side, by the exponential.
+    return in_grid * EARTH_RADIUS_KM * max(r, 1.0) * np.exp(in_grid)
 
 
 @borrowing_kernel
@@ -310,42 +334,54 @@ def _enter_ball(cones, sweep, x, ball, entering):
     The ball has the centre `x` (3,) [km], GCRF, and the radius `ball` [km]. `cones` and `sweep` as
     in `_walk`.
     """
-    size, low, high, count = entering.size, entering.low, entering.high, entering.filled
-    keys, slots, latest = entering.keys, entering.slots, entering.latest
+    size, low, high = entering.size, entering.low, entering.high
     distance = np.sqrt(x[0] * x[0] + x[1] * x[1] + x[2] * x[2])
+    # In cells. The scale of the grid is largest where the ball is nearest to the Earth.
     per_km, radius = _cells_per_km(distance, size), ball * _cells_per_km(distance - ball, size)
     c0, c1, c2 = x[0] * per_km, x[1] * per_km, x[2] * per_km
     low[0], high[0] = int(np.floor(c0 - radius)), int(np.floor(c0 + radius))
     low[1], high[1] = int(np.floor(c1 - radius)), int(np.floor(c1 + radius))
     low[2], high[2] = int(np.floor(c2 - radius)), int(np.floor(c2 + radius))
-    surface2 = 1.0 / (size * size)  # squared radius of the Earth, in cells
+    earth2 = 1.0 / (size * size)  # squared radius of the Earth, in cells
     for i in range(low[0], high[0] + 1):
-        d0 = max(i - c0, c0 - i - 1.0, 0.0)
+        d0 = max(i - c0, c0 - i - 1.0, 0.0)  # from the ball's centre to the cell, along an axis
+        far0 = max(-i, i + 1)  # from the Earth's centre to the cell's far side
         for j in range(low[1], high[1] + 1):
-            d1 = max(j - c1, c1 - j - 1.0, 0.0)
+            d1, far1 = max(j - c1, c1 - j - 1.0, 0.0), max(-j, j + 1)
             for k in range(low[2], high[2] + 1):
-                d2 = max(k - c2, c2 - k - 1.0, 0.0)
+                d2, far2 = max(k - c2, c2 - k - 1.0, 0.0), max(-k, k + 1)
                 if d0 * d0 + d1 * d1 + d2 * d2 > radius * radius:
                     continue
-                far0, far1, far2 = max(-i, i + 1), max(-j, j + 1), max(-k, k + 1)
-                if far0 * far0 + far1 * far1 + far2 * far2 < surface2:
+                if far0 * far0 + far1 * far1 + far2 * far2 < earth2:
                     continue  # all of the cell is inside the Earth
-                key = _key(i, j, k)
-                at = _slot(keys, key)
-                if keys[at] != 0 and latest[slots[at]] == sweep[0]:
-                    continue
-                if not _touches(cones, sweep, size, i, j, k):
-                    continue
-                if keys[at] == 0:
-                    if count[1] >= len(latest):
-                        return False
-                    keys[at], slots[at] = key, count[1]
-                    count[1] += 1
-                if count[0] >= len(entering.by_sensor_cell):
+                if not _enter_cell(cones, sweep, i, j, k, entering):
                     return False
-                latest[slots[at]] = sweep[0]
-                entering.by_sensor_cell[count[0]] = slots[at]
-                count[0] += 1
+    return True
+
+
+@borrowing_kernel
+def _enter_cell(cones, sweep, i, j, k, entering):
+    """Enter a sensor in the cell (i, j, k) if its cone touches it; false if the arrays are full.
+
+    A sensor is entered once in a cell. `cones` and `sweep` as in `_walk`.
+    """
+    keys, slots, latest, count = entering.keys, entering.slots, entering.latest, entering.filled
+    key = _key(i, j, k)
+    at = _slot(keys, key)
+    if keys[at] != 0 and latest[slots[at]] == sweep[0]:
+        return True
+    if not _touches(cones, sweep, entering.size, i, j, k):
+        return True
+    if keys[at] == 0:
+        if count[1] >= len(latest):
+            return False
+        keys[at], slots[at] = key, count[1]
+        count[1] += 1
+    if count[0] >= len(entering.by_sensor_cell):
+        return False
+    latest[slots[at]] = sweep[0]
+    entering.by_sensor_cell[count[0]] = slots[at]
+    count[0] += 1
     return True
 
 
@@ -356,20 +392,12 @@ def _touches(cones, sweep, size, i, j, k):
     The cell is (i, j, k) of those with this size; `cones` and `sweep` as in `_walk`.
     """
     s, m, shift, turn, reach = sweep
-    # The cell's centre in the grid, and its distance there and in Earth radii, see `_cells_per_km`.
-    y0, y1, y2 = (i + 0.5) * size, (j + 0.5) * size, (k + 0.5) * size
-    f = max(np.sqrt(y0 * y0 + y1 * y1 + y2 * y2), 1e-9)
-    r = np.exp(f - 1.0) if f > 1.0 else f
-    scale = EARTH_RADIUS_KM * r / f
-    # Half the diagonal in km. A cell is larger on its far side, by the exponential.
-    half_diagonal = 0.5 * np.sqrt(3.0) * size
-    near_km = half_diagonal * EARTH_RADIUS_KM * max(r, 1.0) * np.exp(half_diagonal)
-    d0 = y0 * scale - cones[s, m, 0]
-    d1 = y1 * scale - cones[s, m, 1]
-    d2 = y2 * scale - cones[s, m, 2]
+    x0, x1, x2, r = _centre_of(i, j, k, size)
+    d0, d1, d2 = x0 - cones[s, m, 0], x1 - cones[s, m, 1], x2 - cones[s, m, 2]
     along = d0 * cones[s, m, AXIS] + d1 * cones[s, m, AXIS + 1] + d2 * cones[s, m, AXIS + 2]
     length2 = d0 * d0 + d1 * d1 + d2 * d2
-    near_km += shift + turn * np.sqrt(length2)
+    # The cone stands for those until the last instant: they may be this much nearer to the cell.
+    near_km = _half_diagonal_km(r, size) + (shift + turn * np.sqrt(length2))
     if length2 <= near_km * near_km:
         return True
     across = np.sqrt(max(length2 - along * along, 0.0))
