@@ -64,7 +64,7 @@ MIN_FIELD_LOG_ODDS = 8.0  # from `field_log_odds`, to try an attitude on all cen
 DISC_SAMPLES = 64  # points at which a pivot's surroundings are sampled
 PIVOT_TIERS = 4  # pivots are put in order by quarters of their surroundings in the image
 MAX_VOTES = 512  # for one star; further ones are left out
-BIN_SHIFT = 8  # a roll has 16 bits (see `TURN`); without the last 8 it is its bin, one of 256
+BIN_SHIFT = 8  # of the bins of roll, 256 in a full turn; see `votes`
 MAX_BINS = 4096  # of separation, where tolerances are small
 # Work (see `SearchLimits`): in one unit, this number of neighbours is looked up in the roll table,
 # of votes counted, or of pairs of votes compared. Each star takes some units more.

@@ -21,7 +21,7 @@ import numpy as np
 from epipole.tasks.algorithms.geometry.attitude import (
     attitude_information,
 )
-from epipole.tasks.algorithms.kernels import kernel
+from epipole.tasks.algorithms.kernels import borrowing_kernel, kernel
 from epipole.tasks.algorithms.star_identification.evidence import (
     choice_lost,
     log_brightness_ratio,
@@ -44,6 +44,7 @@ from epipole.tasks.algorithms.star_identification.search.votes import (
     MAX_REFINED,
     add_vote,
     agreeing,
+    cell_of,
     companion,
     contradicts_brightness,
     count_refined,
@@ -171,8 +172,8 @@ def matches_needed(problem):
 def _try_counted(problem, i, n_votes, fine, n_tried, votes, refined, min_votes, scratch, best):
     """Try the hypotheses of pivot i with `min_votes` refined votes or more; return the work done.
 
-    Only the votes of the first `n_tried` companions lead to a try. n_votes and `fine` are from
-    `gather_votes`. False votes are taken back from the bins of `refined`; `scratch`, a
+    Only the votes of the first `n_tried` companions lead to a try. n_votes and the shift `fine` are
+    from `gather_votes`. False votes are taken back from the bins of `refined`; `scratch`, a
     `PairScratch`, and `best`, a `Best`, are written.
     """
     centroids, stars, pairs = problem.centroids, problem.stars, problem.pairs
@@ -206,6 +207,33 @@ def _try_counted(problem, i, n_votes, fine, n_tried, votes, refined, min_votes, 
     return work
 
 
+@borrowing_kernel
+def _gather_fullest(problem, i, n_companions, coarse, min_votes, max_cells, votes, refined):
+    """Write the votes of pivot i's fullest cells to `refined`.
+
+    The number of votes that a cell needs is `min_votes`, more where more than `max_cells` cells
+    have that many, and more again until the votes in them fit into `refined`. n_companions and
+    `coarse` are from `count_votes`.
+
+    Returns
+    -------
+    n, fine : int
+        As from `gather_votes`; no votes where no cell has enough.
+    min_votes, n_times : int
+        The number of votes that a cell needs, and how often the votes were gathered.
+    """
+    while votes.reached[min_votes] > max_cells:
+        min_votes += 1
+    n_times = 0
+    while votes.reached[min_votes] > 0:
+        n, fine = gather_votes(problem, i, n_companions, coarse, votes, min_votes, refined)
+        n_times += 1
+        if n <= MAX_REFINED:
+            return n, fine, min_votes, n_times
+        min_votes += 1
+    return 0, 0, min_votes, n_times
+
+
 @kernel
 def _try_pivot(problem, i, order, min_companions, step, needed, votes, refined, scratch, best):
     """Try the hypotheses of pivot i with most votes; return the work done.
@@ -214,26 +242,22 @@ def _try_pivot(problem, i, order, min_companions, step, needed, votes, refined, 
     and `needed` from `matches_needed`. `votes`, `refined` and `scratch` are work space; `best`, a
     `Best`, is updated.
     """
-    enough_votes, cells = ROUNDS[step][3], ROUNDS[step][4]
-    n_companions, cast, log2 = count_votes(problem, i, order, min_companions, enough_votes, votes)
-    work = cast + (problem.pairs.n_stars << log2) // 100
-    min_votes = max(needed - SLACK, 2)
-    while votes.reached[min_votes] > cells:
-        min_votes += 1
-    n_votes, fine = MAX_REFINED + 1, 0
-    while n_votes > MAX_REFINED and votes.reached[min_votes] > 0:
-        n_votes, fine = gather_votes(problem, i, n_companions, log2, votes, min_votes, refined)
-        work += cast
-        min_votes += n_votes > MAX_REFINED
-    if n_votes > MAX_REFINED:
+    enough_votes, max_cells = ROUNDS[step][3], ROUNDS[step][4]
+    n_companions, n_cast, coarse = count_votes(
+        problem, i, order, min_companions, enough_votes, votes
+    )
+    n_votes, fine, min_votes, n_times = _gather_fullest(
+        problem, i, n_companions, coarse, max(needed - SLACK, 2), max_cells, votes, refined
+    )
+    n_cells = cell_of(problem.pairs.n_stars, 0, coarse)
+    work = n_cast * (1 + n_times) + n_cells // 100 + n_votes
+    if n_votes == 0:
         return work
     count_refined(n_votes, fine, refined)
     # Any hypothesis with enough votes has one from these companions.
     n_tried = n_companions - min_votes + 1
-    return (
-        work
-        + n_votes
-        + _try_counted(problem, i, n_votes, fine, n_tried, votes, refined, min_votes, scratch, best)
+    return work + _try_counted(
+        problem, i, n_votes, fine, n_tried, votes, refined, min_votes, scratch, best
     )
 
 

@@ -9,6 +9,9 @@ vote from nearly every true star of the frame. This is a Hough transform over st
 2. The cells are much wider than a roll is uncertain, so most that reach enough votes are
    false. The votes in such cells are refined: counted again in bins about as wide as their
    tolerance (`gather_votes`, `count_refined`). What still has enough votes is worth a try.
+
+A bin of roll is 2^shift parts of `TURN` wide: a roll, shifted right by that number of bits, is its
+bin. `coarse` and `fine` are the shifts of the two counts.
 """
 
 import math
@@ -20,10 +23,10 @@ import numpy.typing as npt
 from epipole.schemas.arrays import Integers
 from epipole.tasks.algorithms.kernels import borrowing_kernel, kernel
 from epipole.tasks.algorithms.star_identification.search.pair_hypotheses import MAX_BETA
-from epipole.tasks.algorithms.star_identification.star_pairs import TURN, range_of
+from epipole.tasks.algorithms.star_identification.star_pairs import TURN, TURN_BITS, range_of
 
 GATE, MAG_GATE = 2.0, 2.0  # of a pair's separation [sigma], of brightness [1-sigma scatter]
-MIN_BINS_LOG2, MAX_BINS_LOG2 = 4, 8  # of roll, in a full turn
+MIN_BINS_LOG2, MAX_BINS_LOG2 = 4, 8  # of roll, in a full turn: of the coarse ones
 MAX_MEAN_VOTES = 0.1  # per cell: false votes seldom agree then
 MAX_CELL_VOTES = 255  # in one cell, which has a byte; further ones are not counted
 
@@ -31,8 +34,7 @@ MAX_CELL_VOTES = 255  # in one cell, which has a byte; further ones are not coun
 class Votes(NamedTuple):
     """Votes of one pivot's companions.
 
-    cast : (stars << MAX_BINS_LOG2,) uint8, the votes of each cell: that of a star and one of 2^log2
-        bins of roll is number (star << log2) + bin
+    cast : (stars << MAX_BINS_LOG2,) uint8, the votes of each cell, see `cell_of`
     reached : (MAX_CELL_VOTES + 2,) int64, reached[v] cells have v votes or more; counted from v = 2
         on. The last one is 0: a search for a number that few cells reach ends there
     companion, low, high : (n,) int64, the companions, rows of the centroids, and the ranges of the
@@ -65,15 +67,25 @@ def make_votes(n_stars, n):
 
 
 @kernel
-def roll_bits(n_votes, n_stars, tolerance):
-    """Return log2 of the number of bins of roll (compiled).
+def coarse_shift(n_votes, n_stars, tolerance):
+    """Return the shift of the coarse bins of roll (compiled).
 
     `tolerance` is the typical one of the votes' rolls, in parts of `TURN`; a bin is at least twice
     as wide. There are not more bins than `MAX_MEAN_VOTES` needs.
     """
-    fine = math.log2(TURN / max(2.0 * tolerance, 1.0))
-    sparse = math.log2(max(n_votes / (MAX_MEAN_VOTES * n_stars), 1.0)) + 1.0
-    return int(min(max(min(fine, sparse), MIN_BINS_LOG2), MAX_BINS_LOG2))
+    by_tolerance = math.log2(TURN / max(2.0 * tolerance, 1.0))
+    by_votes = math.log2(max(n_votes / (MAX_MEAN_VOTES * n_stars), 1.0)) + 1.0
+    bins_log2 = min(max(min(by_tolerance, by_votes), MIN_BINS_LOG2), MAX_BINS_LOG2)
+    return TURN_BITS - int(bins_log2)
+
+
+@borrowing_kernel
+def cell_of(star, turn, coarse):
+    """Return the cell of a star and a roll, 0 <= turn < `TURN`: its row of `Votes.cast`.
+
+    The cells of a star follow each other. After the last one those of the next star begin.
+    """
+    return ((star << TURN_BITS) + turn) >> coarse
 
 
 @borrowing_kernel
@@ -143,8 +155,8 @@ def count_votes(problem, i, order, min_companions, enough_votes, votes):
 
     Returns
     -------
-    n, n_votes, log2 : int
-        Numbers of companions and of votes, and log2 of the number of bins of roll.
+    n, n_votes, coarse : int
+        Numbers of companions and of votes, and the shift of the coarse bins.
     """
     centroids, pairs = problem.centroids, problem.pairs
     n, n_votes, sum_wide = 0, 0, 0
@@ -160,17 +172,17 @@ def count_votes(problem, i, order, min_companions, enough_votes, votes):
         n, n_votes, sum_wide = n + 1, n_votes + 2 * (hi - lo), sum_wide + wide
         if n >= min_companions and n_votes > enough_votes:
             break
-    log2 = roll_bits(n_votes, pairs.n_stars, sum_wide / max(n, 1))
-    votes.cast[: pairs.n_stars << log2] = 0
+    coarse = coarse_shift(n_votes, pairs.n_stars, sum_wide / max(n, 1))
+    votes.cast[: cell_of(pairs.n_stars, 0, coarse)] = 0
     votes.reached[:] = 0
     for m in range(n):
-        _vote(problem, i, m, log2, votes)
-    return n, n_votes, log2
+        _vote(problem, i, m, coarse, votes)
+    return n, n_votes, coarse
 
 
 @borrowing_kernel
-def _vote(problem, i, m, log2, votes):
-    """Count the votes of the pivot's m-th companion, in 2^log2 bins of roll of each star."""
+def _vote(problem, i, m, coarse, votes):
+    """Count the votes of the pivot's m-th companion in the cells."""
     pairs, magnitude = problem.pairs, problem.stars.magnitude
     m_i, m_j, m_ij = implied_magnitudes(problem, i, votes.companion[m])
     mag_gate = MAG_GATE * problem.rule.scatter
@@ -179,21 +191,21 @@ def _vote(problem, i, m, log2, votes):
     for p in range(votes.low[m], votes.high[m]):
         a, b = pairs.first[p], pairs.second[p]
         if as_first and not contradicts_brightness(magnitude, a, b, m_i, m_j, m_ij, mag_gate):
-            _cast(a, int(pairs.at_first[p]) - angle, wide, log2, votes)
+            _cast(a, int(pairs.at_first[p]) - angle, wide, coarse, votes)
         if as_second and not contradicts_brightness(magnitude, b, a, m_i, m_j, m_ij, mag_gate):
-            _cast(b, int(pairs.at_second[p]) - angle, wide, log2, votes)
+            _cast(b, int(pairs.at_second[p]) - angle, wide, coarse, votes)
 
 
 @borrowing_kernel
-def _cast(star, turn, wide, log2, votes):
+def _cast(star, turn, wide, coarse, votes):
     """Count one vote for a star in each cell of roll that its tolerance touches.
 
     `turn` and `wide` are the roll and its tolerance, in parts of `TURN`. `cast` and `reached` of
     `votes` are written.
     """
-    shift, mask = 16 - log2, (1 << log2) - 1
-    for k in range((turn - wide) >> shift, ((turn + wide) >> shift) + 1):
-        cell = (star << log2) + (k & mask)
+    first, last_bin = cell_of(star, 0, coarse), (TURN >> coarse) - 1
+    for k in range((turn - wide) >> coarse, ((turn + wide) >> coarse) + 1):
+        cell = first + (k & last_bin)
         count = votes.cast[cell] + np.uint8(1)  # numba's sum has more than a byte
         if count > MAX_CELL_VOTES:
             continue
@@ -206,7 +218,7 @@ def _cast(star, turn, wide, log2, votes):
 
 MAX_REFINED = 1 << 13  # votes of a pivot that are counted again
 _BINS_LOG2 = 14  # one bin for all stars and rolls with the same hash: collisions only cost time
-_FINE_LOG2 = 12  # of the number of the finest bins of roll, in a full turn
+MIN_FINE_SHIFT = 4  # of the finest bins of roll: 4096 in a full turn
 
 
 class RefinedVotes(NamedTuple):
@@ -242,17 +254,17 @@ def make_refined_votes():
 
 
 @borrowing_kernel
-def gather_votes(problem, i, n_companions, log2, votes, min_votes, refined):
+def gather_votes(problem, i, n_companions, coarse, votes, min_votes, refined):
     """Write pivot i's votes in cells with at least `min_votes` to `refined` (compiled).
 
     Returns
     -------
     n, fine : int
         Number of these votes, more than `MAX_REFINED` where they are too many to be written; and
-        the number of bits by which a roll is shifted to give its bin.
+        the shift of the fine bins, which are at least twice as wide as any tolerance.
     """
     pairs, magnitude = problem.pairs, problem.stars.magnitude
-    mag_gate, shift, n, widest = MAG_GATE * problem.rule.scatter, 16 - log2, 0, 1
+    mag_gate, n, widest = MAG_GATE * problem.rule.scatter, 0, 1
     for m in range(n_companions):
         m_i, m_j, m_ij = implied_magnitudes(problem, i, votes.companion[m])
         as_first, as_second = possible_ways(m_ij, mag_gate)
@@ -263,7 +275,7 @@ def gather_votes(problem, i, n_companions, log2, votes, min_votes, refined):
                 else:
                     a, b, turn = pairs.second[p], pairs.first[p], int(pairs.at_second[p])
                 turn = (turn - votes.angle[m]) & (TURN - 1)
-                if votes.cast[(a << log2) + (turn >> shift)] < min_votes:
+                if votes.cast[cell_of(a, turn, coarse)] < min_votes:
                     continue
                 if contradicts_brightness(magnitude, a, b, m_i, m_j, m_ij, mag_gate):
                     continue
@@ -273,7 +285,7 @@ def gather_votes(problem, i, n_companions, log2, votes, min_votes, refined):
                 refined.pair[n], refined.way[n], refined.companion[n] = p, way, m
                 widest = max(widest, votes.wide[m])
                 n += 1
-    fine = 16 - _FINE_LOG2
+    fine = MIN_FINE_SHIFT
     while (1 << fine) < 2 * widest:
         fine += 1
     return n, fine
@@ -287,7 +299,7 @@ def _bin_of(star, turn):
 
 @borrowing_kernel
 def count_refined(n, fine, refined):
-    """Count the first n votes anew, in bins of 2^fine parts of `TURN` (compiled)."""
+    """Count the first n votes anew, in the fine bins (compiled)."""
     refined.bins[:] = 0
     for k in range(n):
         add_vote(k, fine, 1, refined)
