@@ -279,6 +279,17 @@ def aperiodic_rows(n: int, wanted: int) -> Indices:
     return np.unique((np.arange(wanted) * golden % 1.0 * n).astype(np.int64))[:n]
 
 
+class _Attempt(NamedTuple):
+    """One search of the probed frames.
+
+    model : what is assumed of the sensor
+    thorough : whether the search may take long, and is one of a crowd
+    """
+
+    model: SensorModel
+    thorough: bool
+
+
 def _first_scale(
     probe: FrameSample, skies: Skies, model: SensorModel, scales: tuple[float, ...], crowded: bool
 ) -> tuple[SensorModel, list[Solution | None]]:
@@ -287,28 +298,36 @@ def _first_scale(
 
     If none does: the given model with the first scale, and None for each frame.
     """
-    attempts = list(_attempts(probe.centroids, skies, model, scales, crowded))
+    attempts = _attempts(probe.centroids, skies, model, scales, crowded)
     matching = model.matching
-    tries = [(tried, False) for tried in attempts]
-    if crowded:
-        # Unless the brightest centroids are stars, only a thorough search finds stars. It is tried
-        # with the first scale, and with either depth of the sky.
-        tries += [(each, True) for each in attempts if each.scale == scales[0] and each.use_flux]
     # Each further attempt is one more chance of a false alarm.
-    threshold = matching.threshold + np.log(max(len(tries) - 1, 1))
+    threshold = matching.threshold + np.log(max(len(attempts) - 1, 1))
     thorough = matching._replace(threshold=threshold)
     quick = _quick(thorough)
-    weight = np.where([is_thorough for _, is_thorough in tries], THOROUGH, 1.0)
-    of_all = _probe_share(len(probe.t_s))
-    # A share is of what is left of the budget, if the attempts before have spent all of theirs.
-    for k, (tried, is_thorough) in enumerate(tries):
-        attempt = tried._replace(matching=thorough if is_thorough else quick)
-        share = of_all * weight[k] / (weight.sum() - of_all * weight[:k].sum())
-        tried_all = identify_sample(probe, skies, attempt, share=share, one_will_do=is_thorough)
-        found = tried_all[0].each()
+    weights = np.where([attempt.thorough for attempt in attempts], THOROUGH, 1.0)
+    shares = _shares_of_rest(weights, _probe_share(len(probe.t_s)))
+    for attempt, share in zip(attempts, shares, strict=True):
+        tried = attempt.model._replace(matching=thorough if attempt.thorough else quick)
+        solutions, _ = identify_sample(
+            probe, skies, tried, share=share, one_will_do=attempt.thorough
+        )
+        found = solutions.each()
         if any(found):
-            return _likeliest_scale(probe.centroids, found, skies, tried, scales)
+            return _likeliest_scale(probe.centroids, found, skies, attempt.model, scales)
     return model._replace(scale=scales[0]), [None] * len(probe.t_s)
+
+
+def _shares_of_rest(weights: Array, of_all: float) -> list[float]:
+    """Return the share of what is left of a budget that each of n attempts may spend.
+
+    Together they may spend the part `of_all` of the budget, divided by their weights (n,). So
+    attempt k may spend ``p[k] = of_all * weights[k] / weights.sum()`` of the whole budget. If those
+    before it have spent all of theirs, ``1 - p[:k].sum()`` is left: its share is the ratio.
+    """
+    total = weights.sum()
+    return [
+        of_all * weights[k] / (total - of_all * weights[:k].sum()) for k in range(len(weights))
+    ]
 
 
 def _quick(matching: MatchSettings) -> MatchSettings:
@@ -322,6 +341,26 @@ def _probe_share(n_probed: int) -> float:
 
 
 def _attempts(
+    probe: RawCentroids,
+    skies: Skies,
+    model: SensorModel,
+    scales: tuple[float, ...],
+    crowded: bool,
+) -> list[_Attempt]:
+    """Return the attempts, the likeliest first, and all quick ones before the thorough ones.
+
+    Unless the brightest centroids of a crowd are stars, only a thorough search finds stars. It is
+    tried with the first scale, and with either depth of the sky.
+    """
+    models = list(_models(probe, skies, model, scales, crowded))
+    quick = [_Attempt(tried, thorough=False) for tried in models]
+    if not crowded:
+        return quick
+    thorough = [tried for tried in models if tried.scale == scales[0] and tried.use_flux]
+    return [*quick, *(_Attempt(tried, thorough=True) for tried in thorough)]
+
+
+def _models(
     probe: RawCentroids,
     skies: Skies,
     model: SensorModel,

@@ -266,3 +266,11 @@ def test_searches_of_a_log_end_at_its_budget_and_say_so(monkeypatch):
     assert "search_limit" in found.status
     assert not found.solutions.solved.any()
     assert _identify(crowds, matching=half).status == found.status
+
+
+def test_attempts_that_spend_all_they_may_share_the_part_of_the_budget_by_weight():
+    weights, left, spent = np.array([1.0, 1.0, 12.0, 1.0]), 1.0, []
+    for share in sensor._shares_of_rest(weights, 0.4):
+        spent.append(share * left)
+        left -= spent[-1]
+    assert spent == pytest.approx(0.4 * weights / weights.sum())
