@@ -138,7 +138,8 @@ class _Evidence(NamedTuple):
     """How the pairs of two frames are judged.
 
     density : (depth,) float, free detections per steradian in the newest frame and those before
-    best : (N_RATES, k) float, log-evidence that earlier frames can add at most, see `_max_evidence`
+    best : (N_RATES, k) float, log-evidence that earlier frames can add at most, see `_max_evidence`;
+        of the frames to which chains are followed
     log_pairs : ln of the number of pairs, each of which may be a false alarm
     faint : whether objects that are detected in few frames are searched for
     """
@@ -361,7 +362,7 @@ def _fastest(best, class_rates, wanted, dt, pairs_sr, rule):
     """Return the maximum rate to search for [rad/s].
 
     Up to it, chains can reach the evidence `wanted`, and the number of pairs is within the limit.
-    `best` (N_RATES, k) is from `_max_evidence`, class_rates (N_RATES + 1,) [rad/s] from
+    `best` (N_RATES, k) is that of `_Evidence`, class_rates (N_RATES + 1,) [rad/s] from
     `_class_rates`. `dt` [s] is the time between the frames. pairs_sr [1/sr], times the solid angle
     about a detection in which the other may lie, is the number of pairs.
     """
@@ -483,18 +484,32 @@ def _try_pairs(f, g, reach, detections, recent, rule, evidence, chains):
 
 
 @kernel
-def _useful_depth(best, wanted):
+def _useful_depth(of_all, wanted):
     """Return the number of frames back in which a chain is followed.
 
-    In these, the slowest object reaches the evidence `wanted` even with one miss. `best`
+    In these, the slowest object reaches the evidence `wanted` even with one miss. `of_all`
     (N_RATES, k) is from `_max_evidence`.
     """
-    n_back = best.shape[1] - 1
+    n_back = of_all.shape[1] - 1
     for k in range(1, n_back):
-        last = best[0, k - 1] - best[0, k]
-        if best[0, 0] - best[0, k] > wanted + last - LOG_MISS:
+        last = of_all[0, k - 1] - of_all[0, k]
+        if of_all[0, 0] - of_all[0, k] > wanted + last - LOG_MISS:
             return k
     return n_back
+
+
+@kernel
+def _of_first(n_back, of_all):
+    """Return the maximum log-evidence of the first n_back frames before g, (N_RATES, n_back + 1).
+
+    `of_all` (N_RATES, k) is that of all frames before g, from `_max_evidence`. Its columns are sums
+    over a frame and all earlier ones: those too early are taken off.
+    """
+    out = np.empty((N_RATES, n_back + 1))
+    for c in range(N_RATES):
+        for k in range(n_back + 1):
+            out[c, k] = of_all[c, k] - of_all[c, n_back]
+    return out
 
 
 @kernel
@@ -523,13 +538,11 @@ def _strongest_chains(f, depth, detections, recent, rule):
         if not occurring.any():
             continue
         occurring[0] = True  # `_useful_depth` needs the slowest class
-        best = _max_evidence(f, g, times, density, variance, class_rates, occurring)
-        n_back = best.shape[1] - 1
+        of_all = _max_evidence(f, g, times, density, variance, class_rates, occurring)
+        n_back = of_all.shape[1] - 1
         if not faint:
-            n_back = max(_useful_depth(best, wanted), min(depth - (f - g) - 1, n_back))
-        for c in range(N_RATES):
-            best[c] -= best[c, n_back]
-        best = best[:, : n_back + 1].copy()
+            n_back = max(_useful_depth(of_all, wanted), min(depth - (f - g) - 1, n_back))
+        best = _of_first(n_back, of_all)
         rate = _fastest(best, class_rates, wanted, dt, pairs_sr, rule)
         if g < f - 1 and pairs_sr * np.pi * (rate * dt) ** 2 > FEW_PAIRS:
             continue
