@@ -138,8 +138,8 @@ class _Evidence(NamedTuple):
     """How the pairs of two frames are judged.
 
     density : (depth,) float, free detections per steradian in the newest frame and those before
-    best : (N_RATES, k) float, log-evidence that earlier frames can add at most, see `_max_evidence`;
-        of the frames to which chains are followed
+    best : (N_RATES, k) float, log-evidence that earlier frames can add at most, of those to which
+        chains are followed; see `_max_evidence`
     log_pairs : ln of the number of pairs, each of which may be a false alarm
     faint : whether objects that are detected in few frames are searched for
     """
