@@ -20,16 +20,16 @@ from epipole.tasks.algorithms.log_checks.free_fall import (
     read_arc,
 )
 
-SCALES = (1.0, 1e-3)  # kilometres, metres
+KILOMETRES, METRES = 1.0, 1e-3  # scales
+# How axes turn [rad/s]. Exchanged ones turn with the Earth, about another axis or the other way.
 INERTIAL = np.zeros(3)
 EARTH_FIXED = np.array([0.0, 0.0, EARTH_RATE_RAD_S])
 _AXES = [sign * EARTH_RATE_RAD_S * axis for axis in np.eye(3) for sign in (1.0, -1.0)]
-RATES = (INERTIAL, EARTH_FIXED, *(w for w in _AXES if not np.array_equal(w, EARTH_FIXED)))
+EXCHANGED = [rate for rate in _AXES if not np.array_equal(rate, EARTH_FIXED)]
 FARTHEST_KM = 2e6  # a bound orbit about the Earth ends before
 # An excess is within its error up to 1; beyond doubt from `FAR` on, where another reading leaves
-# but a fifth of it. A share of gravity is
-# allowed for what the model leaves out: the flattening is a six-hundredth of it. Sun and Moon
-# pull at a distant sensor.
+# but a fifth of it. A share of gravity is allowed for what the model leaves out: the flattening is
+# a six-hundredth of it. Sun and Moon pull at a distant sensor.
 FAR = 1.5
 CLEARLY = 0.2
 MODEL_SHARE = 0.01
@@ -38,63 +38,81 @@ SIGMAS = 5.0
 
 
 class Reading(NamedTuple):
-    """A reading of positions: they are kilometres after `scale`, in axes that turn at `rate`."""
+    """A reading of positions: they are kilometres after `scale`, in axes that turn at this rate."""
 
     scale: float
     rate_rad_s: Array
+
+    def has_unit_of(self, other: "Reading") -> bool:
+        """Return whether both are in the same unit."""
+        return self.scale == other.scale
+
+    def has_axes_of(self, other: "Reading") -> bool:
+        """Return whether both are in the same axes."""
+        return np.array_equal(self.rate_rad_s, other.rate_rad_s)
 
 
 class ReadingFit(NamedTuple):
     """How well a reading fits all arcs of a sensor.
 
-    `misfit` is the excess acceleration in units of what is allowed, `share` in units of gravity,
-    with a fifth of what is allowed as its error; the median over the arcs.
+    `arcs` are as the reading has them. `misfit` is the excess acceleration in units of what is
+    allowed, `share` in units of gravity, with a fifth of what is allowed as its error; the median
+    over the arcs.
     """
 
     reading: Reading
+    arcs: list[ReadArc]
     misfit: float
     share: float
     share_sigma: float
 
 
-def main_readings(stated_rate: Array) -> list[Reading]:
-    """Return the stated reading, the other frame, and the other unit."""
-    other = EARTH_FIXED if stated_rate is INERTIAL else INERTIAL
-    kilometres, metres = SCALES
-    return [
-        Reading(kilometres, stated_rate), Reading(kilometres, other), Reading(metres, stated_rate)
-    ]  # fmt: skip
+def stated_reading(earth_fixed: bool) -> Reading:
+    """Return the reading that a log states: kilometres, inertial or Earth-fixed."""
+    return Reading(KILOMETRES, EARTH_FIXED if earth_fixed else INERTIAL)
 
 
-def all_readings(stated_rate: Array) -> list[Reading]:
-    """Return all readings; the stated one is the first.
+def main_readings(stated: Reading) -> list[Reading]:
+    """Return the readings beside the stated one with a single mistake that is frequent.
+
+    The frame is the other one, or the unit.
+    """
+    return [in_other_frame(stated), stated._replace(scale=METRES)]
+
+
+def all_readings(stated: Reading) -> list[Reading]:
+    """Return all readings beside the stated one.
 
     Exchanged axes show only where they should turn with the Earth. With another stated frame they
     would be a second mistake, and thrust may look like one.
     """
-    rates = [stated_rate, *(w for w in RATES if w is not stated_rate)]
-    rates = rates if stated_rate is EARTH_FIXED else rates[:2]
-    return [Reading(scale, rate) for scale in SCALES for rate in rates]
+    axes = [stated, in_other_frame(stated)]
+    if np.array_equal(stated.rate_rad_s, EARTH_FIXED):
+        axes += [stated._replace(rate_rad_s=rate) for rate in EXCHANGED]
+    return [*axes[1:], *(reading._replace(scale=METRES) for reading in axes)]
 
 
-def read_arcs(arcs: Sequence[Arc], reading: Reading) -> list[ReadArc]:
-    """Return all arcs of a sensor as a reading has them."""
-    return [read_arc(arc, *reading) for arc in arcs]
+def in_other_frame(reading: Reading) -> Reading:
+    """Return an Earth-fixed reading for one in inertial axes, an inertial one for any other."""
+    is_inertial = np.array_equal(reading.rate_rad_s, INERTIAL)
+    return reading._replace(rate_rad_s=EARTH_FIXED if is_inertial else INERTIAL)
 
 
-def fit_reading(
-    arcs: Sequence[ReadArc], reading: Reading, use_velocities: bool = False
-) -> ReadingFit:
-    """Return how well a reading fits.
+def fit_reading(arcs: Sequence[Arc], reading: Reading) -> ReadingFit:
+    """Return how well a reading fits all arcs of a sensor."""
+    return _fit([read_arc(arc, reading.scale, reading.rate_rad_s) for arc in arcs], reading, False)
 
-    Parameters
-    ----------
-    arcs
-        As the reading has them.
-    use_velocities
-        Whether velocities are known to be those of the path: then the better of the two
-        estimates counts.
+
+def with_velocities(fit: ReadingFit) -> ReadingFit:
+    """Return how well a reading fits if velocities are known to be those of the path.
+
+    Then the better of the two estimates counts, arc by arc.
     """
+    return _fit(fit.arcs, fit.reading, use_velocities=True)
+
+
+def _fit(arcs: list[ReadArc], reading: Reading, use_velocities: bool) -> ReadingFit:
+    """Return how well a reading fits arcs that were read so."""
     rows = []
     for arc in arcs:
         radius_km = float(np.median(np.linalg.norm(arc.r_km, axis=1)))
@@ -111,7 +129,7 @@ def fit_reading(
             excess / found.gravity_km_s2,
             allowed / SIGMAS / found.gravity_km_s2,
         ])  # fmt: skip
-    return ReadingFit(reading, *np.median(np.array(rows), axis=0).tolist())
+    return ReadingFit(reading, arcs, *np.median(np.array(rows), axis=0).tolist())
 
 
 def is_on_the_ground(arcs: Sequence[Arc]) -> bool:

@@ -32,9 +32,11 @@ from epipole.tasks.algorithms.log_checks.readings import (
     ReadingFit,
     all_readings,
     fit_reading,
+    in_other_frame,
     is_on_the_ground,
     main_readings,
-    read_arcs,
+    stated_reading,
+    with_velocities,
 )
 from epipole.tasks.algorithms.log_checks.velocities import check_velocities
 
@@ -96,64 +98,58 @@ def check_states(states: LogStates) -> list[Finding]:
 
 
 def _readings(arcs: Sequence[Arc], earth_fixed: bool) -> tuple[float, list[Finding]]:
-    """Return the unit of positions [km], and the findings on unit, frame and velocities.
-
-    The first reading is the stated one.
-    """
-    stated = EARTH_FIXED if earth_fixed else INERTIAL
-    readings = [(reading, read_arcs(arcs, reading)) for reading in main_readings(stated)]
-    fits = [fit_reading(read, reading) for reading, read in readings]
-    if fits[0].misfit > FAR:
-        readings = [(reading, read_arcs(arcs, reading)) for reading in all_readings(stated)]
-        fits = [fit_reading(read, reading) for reading, read in readings]
-    best = _chosen(fits)
-    velocity = check_velocities(*(read for r, read in readings if r is best.reading))
+    """Return the unit of positions [km], and the findings on unit, frame and velocities."""
+    stated = fit_reading(arcs, stated_reading(earth_fixed))
+    find_others = all_readings if stated.misfit > FAR else main_readings
+    others = [fit_reading(arcs, reading) for reading in find_others(stated.reading)]
+    best = _chosen(stated, others)
+    velocity = check_velocities(best.arcs)
     if velocity.verdict == SOUND:
-        fits = [fit_reading(read, reading, use_velocities=True) for reading, read in readings]
-        best = _chosen(fits)
-    return best.reading.scale, [_unit(fits, best), _frame(fits, best), velocity]
+        stated, others = with_velocities(stated), [with_velocities(fit) for fit in others]
+        best = _chosen(stated, others)
+    findings = [_unit(stated, others, best), _frame(stated, others, best), velocity]
+    return best.reading.scale, findings
 
 
-def _chosen(fits: Sequence[ReadingFit]) -> ReadingFit:
+def _chosen(stated: ReadingFit, others: Sequence[ReadingFit]) -> ReadingFit:
     """Return the stated reading unless it does not fit and another does."""
-    stated = fits[0]
     if stated.misfit <= FAR:
         return stated
-    fitting = [fit for fit in fits if fit.misfit <= min(1.0, CLEARLY * stated.misfit)]
+    fitting = [fit for fit in others if fit.misfit <= min(1.0, CLEARLY * stated.misfit)]
     if not fitting:
         return stated
-    same_unit = [fit for fit in fitting if fit.reading.scale == stated.reading.scale]
+    same_unit = [fit for fit in fitting if fit.reading.has_unit_of(stated.reading)]
     # With the unit alone wrong, the frame is as stated.
-    as_stated = [fit for fit in fitting if fit.reading.rate_rad_s is stated.reading.rate_rad_s]
-    return min(same_unit or as_stated or fitting, key=lambda fit: fit.misfit)
+    same_axes = [fit for fit in fitting if fit.reading.has_axes_of(stated.reading)]
+    return min(same_unit or same_axes or fitting, key=lambda fit: fit.misfit)
 
 
-def _unit(fits: Sequence[ReadingFit], best: ReadingFit) -> Finding:
-    stated, value = fits[0], best.share
-    found = Finding(POSITION_UNIT, SOUND, value, best.share_sigma, 0.0)
-    if best.reading.scale != stated.reading.scale:
+def _unit(stated: ReadingFit, others: Sequence[ReadingFit], best: ReadingFit) -> Finding:
+    """Return the finding on the unit of positions."""
+    found = Finding(POSITION_UNIT, SOUND, best.share, best.share_sigma, 0.0)
+    if not best.reading.has_unit_of(stated.reading):
         return found._replace(verdict=WRONG, cause="positions_in_m", value=stated.share)
-    if stated.misfit > NO_FALL and best is stated:
+    if stated.misfit > NO_FALL and best.reading.has_axes_of(stated.reading):
         return found._replace(verdict=UNKNOWN, cause="no_free_fall")
-    others = [fit for fit in fits if fit.reading.scale != stated.reading.scale]
-    if min(fit.misfit for fit in others) <= 1.0:
+    other_unit = [fit for fit in others if not fit.reading.has_unit_of(stated.reading)]
+    if min(fit.misfit for fit in other_unit) <= 1.0:
         return found._replace(verdict=UNKNOWN, cause="arc_too_short")
     return found
 
 
-def _frame(fits: Sequence[ReadingFit], best: ReadingFit) -> Finding:
-    of_unit = [fit for fit in fits if fit.reading.scale == best.reading.scale]
-    first = of_unit[0]
-    found = Finding(REFERENCE_FRAME, SOUND, first.share, first.share_sigma, 0.0)
-    if best.reading.rate_rad_s is first.reading.rate_rad_s:
-        main = [f for f in of_unit[1:] if f.reading.rate_rad_s is INERTIAL
-                or f.reading.rate_rad_s is EARTH_FIXED]  # fmt: skip
-        if any(fit.misfit <= 1.0 for fit in main):
-            return found._replace(verdict=UNKNOWN, cause="arc_too_short")
-        if first.misfit > 1.0:
-            return found._replace(verdict=UNKNOWN, cause="no_free_fall")
-        return found
-    return found._replace(verdict=WRONG, cause=_frame_cause(best.reading.rate_rad_s))
+def _frame(stated: ReadingFit, others: Sequence[ReadingFit], best: ReadingFit) -> Finding:
+    """Return the finding on the frame of positions, which are in the unit of the best reading."""
+    of_unit = [fit for fit in (stated, *others) if fit.reading.has_unit_of(best.reading)]
+    as_stated = next(fit for fit in of_unit if fit.reading.has_axes_of(stated.reading))
+    found = Finding(REFERENCE_FRAME, SOUND, as_stated.share, as_stated.share_sigma, 0.0)
+    if not best.reading.has_axes_of(stated.reading):
+        return found._replace(verdict=WRONG, cause=_frame_cause(best.reading.rate_rad_s))
+    other_frame = in_other_frame(stated.reading)
+    if any(fit.misfit <= 1.0 for fit in of_unit if fit.reading.has_axes_of(other_frame)):
+        return found._replace(verdict=UNKNOWN, cause="arc_too_short")
+    if as_stated.misfit > 1.0:
+        return found._replace(verdict=UNKNOWN, cause="no_free_fall")
+    return found
 
 
 def _frame_cause(rate: Array) -> str:
