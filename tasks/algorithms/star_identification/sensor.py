@@ -325,9 +325,7 @@ def _shares_of_rest(weights: Array, of_all: float) -> list[float]:
     before it have spent all of theirs, ``1 - p[:k].sum()`` is left: its share is the ratio.
     """
     total = weights.sum()
-    return [
-        of_all * weights[k] / (total - of_all * weights[:k].sum()) for k in range(len(weights))
-    ]
+    return [of_all * weights[k] / (total - of_all * weights[:k].sum()) for k in range(len(weights))]
 
 
 def _quick(matching: MatchSettings) -> MatchSettings:

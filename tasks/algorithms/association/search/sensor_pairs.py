@@ -8,6 +8,8 @@
    the space that it shares. With few sensors, `EveryPair` takes all of them.
 """
 
+from typing import NamedTuple
+
 import numpy as np
 
 from epipole.schemas.arrays import Array, Flags, Indices
@@ -20,14 +22,18 @@ from epipole.tasks.algorithms.association.search.field_index import (
     ground_range,
 )
 from epipole.tasks.algorithms.association.search.seeds import SHORTEST_BASELINE_KM
+from epipole.tasks.algorithms.association.search.shared_points import (
+    MIDDLE_SHARE,
+    FieldMiddles,
+    edge_points,
+    field_middles,
+    middle_points,
+)
 from epipole.tasks.algorithms.association.views import (
-    PLANE,
     SIGMA_KM,
     XX,
     YY,
     Views,
-    X,
-    Y,
     direction,
 )
 from epipole.tasks.algorithms.constants import EARTH_RADIUS_KM
@@ -43,8 +49,6 @@ FEW_TRACKLETS = 8  # of a sensor in a window: seeding with no more costs next to
 # and this number of sigmas: far more than those of one object miss by, and few others do.
 PASSING_RAD, PASSING_KM, PASSING_SIGMA = 5e-3, 20.0, 5.0
 N_EDGES = 8  # outermost tracklets of a sensor, one for each of these directions on its plane
-# Part of a crowded field's half-angle within which a pair covers points: its edges are left out.
-MIDDLE_SHARE = 0.5
 
 
 def meeting_pairs(index: FieldIndex, cones: Array, farthest_km: float) -> tuple[Indices, Indices]:
@@ -308,6 +312,43 @@ class EveryPair:
         return next(self._pairs, None)
 
 
+class RankedPairs(NamedTuple):
+    """The n pairs of sensors that may seed, the longest baseline first, with p points each.
+
+    a, b : (n,) int
+        The sensors.
+    always : (n,) bool
+        It seeds even where others cover its points.
+    points : (n, p, 3) float
+        Points [km], GCRF, of the space that both share; NaN where there is no such point.
+    share : (n,) float
+        Part of the half-angle of a field in which these points are covered.
+    waiting : (n,) bool, changed
+        It has not seeded yet.
+    covered : (n, p) int, changed
+        How many pairs that have seeded cover each point; without a point the largest number.
+    """
+
+    a: Indices
+    b: Indices
+    always: Flags
+    points: Array
+    share: Array
+    waiting: Flags
+    covered: Indices
+
+
+class PointsByCell(NamedTuple):
+    """The points of `RankedPairs` by the cells of a `FieldIndex`.
+
+    first, point : (c + 1,), (n p,) int
+        Points of cell q are ``point[first[q]:first[q + 1]]``. Point c of pair k is number k p + c.
+    """
+
+    first: Indices
+    point: Indices
+
+
 class SensorPairs:
     """Pairs of sensors that may see one object, in the order in which they should seed.
 
@@ -321,40 +362,19 @@ class SensorPairs:
     """
 
     def __init__(self, views: Views, farthest_km: float, index: FieldIndex, cones: Array) -> None:
-        look, position, half, edges = _middle(views, N_EDGES)
+        fields, n_sensors = field_middles(views, N_EDGES), len(views.camera)
         a, b = meeting_pairs(index, cones, farthest_km)
-        n_overlapping = np.bincount(np.append(a, b), minlength=len(look))
+        crowded = np.bincount(np.append(a, b), minlength=n_sensors) > FEW_SENSORS
         sparse = sparse_sensors(views)
         dense = ~(sparse[a] & sparse[b])
         passing = passing_pairs(views, sparse, farthest_km)
-        a, b = _together((a[dense], b[dense]), passing, len(look))
-        baseline = position[b] - position[a]
-        known = np.linalg.norm(baseline, axis=1) > SHORTEST_BASELINE_KM  # false for NaN
-        across = np.linalg.norm(np.cross(baseline, look[a] + look[b]), axis=1) / 2
-        order = np.flatnonzero(known)[np.argsort(-across[known], kind="stable")]
-        self._a, self._b = a[order], b[order]
-        middle, many = (look, position, half), n_overlapping > FEW_SENSORS  # in crowded space
-        few = ~many[self._a] & ~many[self._b]
-        # Points of the shared space: one in the middle, others at the edges where few sensors are.
-        self._points = np.full((len(order), 1 + N_EDGES, 3), np.nan)
-        self._points[:, 0] = _middle_points(middle, many, self._a, self._b, farthest_km)
-        self._points[few, 1:] = _shared_points(
-            middle, edges, self._a[few], self._b[few], farthest_km
-        )
-        self._share = np.where(few, 1.0, MIDDLE_SHARE)
-        self._look, self._position, self._half = middle
-        self._always = sparse[self._a] & sparse[self._b]
-        self._waiting = np.ones(len(order), bool)
-        self._busy = np.zeros(len(look), bool)
-        # How many earlier pairs cover each point of a pair. A point that is not shared (NaN) counts
-        # as covered.
-        shared = np.isfinite(self._points[..., 0])
-        self._covered = np.where(shared, 0, np.iinfo(np.int64).max)
-        self._index = index
-        cell = _cells_of(index, self._points)
-        self._by_cell = np.argsort(cell, axis=None, kind="stable")  # see `_cover`
-        self._first = np.searchsorted(cell.ravel()[self._by_cell], np.arange(len(index.first)))
-        self._next = 0
+        a, b = _together((a[dense], b[dense]), passing, n_sensors)
+        a, b = _longest_first(fields, a, b)
+        self._index, self._fields = index, fields
+        self._pairs = _ranked_pairs(fields, crowded, sparse, a, b, farthest_km)
+        self._by_cell = _points_by_cell(index, self._pairs.points)
+        self._busy = np.zeros(n_sensors, bool)  # sensors that have taken part in this round
+        self._next = 0  # the pair at which the search for the next one begins
 
     def next(self, enough: float = np.inf) -> tuple[int, int] | None:
         """Return the next pair, None after the last.
@@ -362,37 +382,80 @@ class SensorPairs:
         A pair is skipped where `enough` of the earlier pairs cover each point that it shares.
         These points are in the middle of the shared space and, if it is not crowded, at its edges.
         """
-        state = (self._a, self._b, self._always, self._waiting, self._covered, self._busy)
-        k = _next_pair(*state, float(enough), self._next)
+        pairs = self._pairs
+        k = _next_pair(pairs, self._busy, float(enough), self._next)
         if k < 0:
             self._busy[:] = False
-            k = _next_pair(*state, float(enough), 0)
+            k = _next_pair(pairs, self._busy, float(enough), 0)
             if k < 0:
                 self._next = 0
                 return None
-        a, b = int(self._a[k]), int(self._b[k])
-        self._waiting[k] = False
+        a, b = int(pairs.a[k]), int(pairs.b[k])
+        pairs.waiting[k] = False
         self._busy[[a, b]] = True
         self._next = k + 1
-        _cover(
-            self._index, a, b, (self._look, self._position, self._half), self._share, self._points,
-            self._first, self._by_cell, self._covered,
-        )  # fmt: skip
+        _cover(self._index, a, b, self._fields, self._by_cell, pairs)
         return a, b
 
 
+def _longest_first(fields: FieldMiddles, a: Indices, b: Indices) -> tuple[Indices, Indices]:
+    """Return the pairs of sensors a (n,) and b (n,), those with the longest baseline across the
+    line of sight first, without those whose baseline is too short or unknown."""
+    baseline = fields.position[b] - fields.position[a]
+    known = np.linalg.norm(baseline, axis=1) > SHORTEST_BASELINE_KM  # false for NaN
+    across = np.linalg.norm(np.cross(baseline, fields.look[a] + fields.look[b]), axis=1) / 2
+    order = np.flatnonzero(known)[np.argsort(-across[known], kind="stable")]
+    return a[order], b[order]
+
+
+def _ranked_pairs(
+    fields: FieldMiddles,
+    crowded: Flags,
+    sparse: Flags,
+    a: Indices,
+    b: Indices,
+    farthest_km: float,
+) -> RankedPairs:
+    """Return the pairs of a (n,) and b (n,), in their order, with the points that they share.
+
+    There is one in the middle of the shared space. Others are at its edges, if neither sensor is
+    `crowded` (s,). Pairs of two `sparse` sensors (s,) always seed.
+    """
+    roomy = ~crowded[a] & ~crowded[b]
+    points = np.full((len(a), 1 + N_EDGES, 3), np.nan)
+    points[:, 0] = middle_points(fields, crowded, a, b, farthest_km)
+    points[roomy, 1:] = edge_points(fields, a[roomy], b[roomy], farthest_km)
+    return RankedPairs(
+        a,
+        b,
+        always=sparse[a] & sparse[b],
+        points=points,
+        share=np.where(roomy, 1.0, MIDDLE_SHARE),
+        waiting=np.ones(len(a), bool),
+        covered=np.where(np.isfinite(points[..., 0]), 0, np.iinfo(np.int64).max),
+    )
+
+
+def _points_by_cell(index: FieldIndex, points: Array) -> PointsByCell:
+    """Return the points (n, p, 3) [km] of pairs by cells; those in no cell come first."""
+    cell = _cells_of(index, points)
+    point = np.argsort(cell, axis=None, kind="stable")
+    first = np.searchsorted(cell.ravel()[point], np.arange(len(index.first)))
+    return PointsByCell(first, point)
+
+
 @borrowing_kernel
-def _next_pair(a, b, always, waiting, covered, busy, enough, begin):
+def _next_pair(pairs, busy, enough, begin):
     """Return the first pair from `begin` on that should seed, its sensors not busy, or -1.
 
-    The n pairs are of the sensors `a` (n,) and `b` (n,). Those that have not seeded are
-    `waiting` (n,), bool. Of these one seeds if it is flagged in `always` (n,), or if one of its p
-    points is covered by fewer than `enough` earlier pairs, as `covered` (n, p) counts. `busy` (s,)
-    bool flags sensors that have seeded in this turn.
+    Of the `RankedPairs` that are waiting, one seeds if it always does, or if one of its points is
+    covered by fewer than `enough` earlier pairs. `busy` (s,) bool flags sensors that have seeded in
+    this round.
     """
+    a, b, covered = pairs.a, pairs.b, pairs.covered
     for k in range(begin, len(a)):
-        if waiting[k] and not busy[a[k]] and not busy[b[k]]:
-            if always[k]:
+        if pairs.waiting[k] and not busy[a[k]] and not busy[b[k]]:
+            if pairs.always[k]:
                 return k
             for c in range(covered.shape[1]):
                 if covered[k, c] < enough:
@@ -401,34 +464,25 @@ def _next_pair(a, b, always, waiting, covered, busy, enough, begin):
 
 
 @kernel
-def _cover(index, a, b, middle, share, points, first, by_cell, covered):
-    """Count the pair of sensors a and b in `covered` for all points that both have in their field.
+def _cover(index, a, b, fields, by_cell, pairs):
+    """Count the pair of sensors a and b in `pairs.covered`, for all points in both their fields.
 
-    Parameters
-    ----------
-    middle : (s, 3), (s, 3), (s,) float
-        Axes, positions [km] and half-angles [rad] of the fields, see `_middle`.
-    share : (n,) float
-        Part of the half-angle that counts, for each of n pairs.
-    points : (n, p, 3) float
-        Their points [km], GCRF.
-    first, by_cell : (c + 1,), (n p,) int
-        Points of cell q are ``by_cell[first[q]:first[q + 1]]``: pair times p plus point.
-    covered : (n, p) int, in and out
-        The counts.
+    `index` is the `FieldIndex`, `fields` the `FieldMiddles`, `by_cell` the `PointsByCell` of
+    `pairs`, which are `RankedPairs`.
     """
-    look, position, half = middle
-    i, j, n_points = index.by_sensor_first[a], index.by_sensor_first[b], points.shape[1]
+    look, position, half, _ = fields
+    first, points, n_points = by_cell.first, pairs.points, pairs.points.shape[1]
+    i, j = index.by_sensor_first[a], index.by_sensor_first[b]
     while i < index.by_sensor_first[a + 1] and j < index.by_sensor_first[b + 1]:
         p, q = index.by_sensor_cell[i], index.by_sensor_cell[j]
         if p == q:
-            for k in by_cell[first[p] : first[p + 1]]:
-                pair, c = k // n_points, k % n_points
-                x, part = points[pair, c], share[pair]
-                if _in_cone(x, look[a], position[a], part * half[a]) and _in_cone(
-                    x, look[b], position[b], part * half[b]
+            for number in by_cell.point[first[p] : first[p + 1]]:
+                k, c = number // n_points, number % n_points
+                x, share = points[k, c], pairs.share[k]
+                if _in_cone(x, look[a], position[a], share * half[a]) and _in_cone(
+                    x, look[b], position[b], share * half[b]
                 ):
-                    covered[pair, c] += 1
+                    pairs.covered[k, c] += 1
         i += p <= q
         j += q <= p
 
@@ -453,118 +507,3 @@ def _cells_of(index, points):
             if np.isfinite(points[k, c, 0]):
                 out[k, c] = cell_at(index, points[k, c])
     return out
-
-
-@kernel
-def _middle(views, n_edges):
-    """Return for each sensor the middle of its tracklets, where it is, and how far they reach.
-
-    At the instant at which it has most tracklets: the normal of its plane (s, 3), its position
-    (s, 3) [km], and the largest angle of a tracklet from the normal (s,) [rad], with a margin. The
-    fourth value are the directions of the outermost tracklets along `n_edges` axes of the plane,
-    (s, n_edges, 3). All are in the GCRF; without tracklets NaN, the angle 0.
-    """
-    n = views.camera.shape[0]
-    look, position, half = np.full((n, 3), np.nan), np.full((n, 3), np.nan), np.zeros(n)
-    edges, axes = np.full((n, n_edges, 3), np.nan), np.empty((n_edges, 2))
-    for e in range(n_edges):
-        axes[e] = np.cos(e * 2 * np.pi / n_edges), np.sin(e * 2 * np.pi / n_edges)
-    outermost = np.empty(n_edges, np.int64)
-    for s in range(n):
-        m, max_count = 0, 0
-        for h in range(len(views.time_s)):
-            count = views.seen[views.first[s] : views.first[s + 1], h].sum()
-            if count > max_count:
-                m, max_count = h, count
-        if max_count == 0:
-            continue
-        look[s], position[s] = views.camera[s, m, PLANE + 6 : PLANE + 9], views.camera[s, m, :3]
-        widest2, farthest = 0.0, np.full(n_edges, -np.inf)
-        for i in range(views.first[s], views.first[s + 1]):
-            if not views.seen[i, m]:
-                continue
-            x, y = views.sight[i, m, X], views.sight[i, m, Y]
-            widest2 = max(widest2, x * x + y * y)
-            for e in range(n_edges):
-                out = x * axes[e, 0] + y * axes[e, 1]
-                if out > farthest[e]:
-                    farthest[e], outermost[e] = out, i
-        for e in range(n_edges):
-            direction(views, outermost[e], m, edges[s, e])
-        half[s] = np.arctan(np.sqrt(widest2)) + 1e-3
-    return look, position, half, edges
-
-
-def _middle_points(
-    middle: tuple[Array, Array, Array], many: Flags, a: Indices, b: Indices, farthest_km: float
-) -> Array:
-    """Return a point [km] in the middle of the space that each pair of sensors shares, (n, 3).
-
-    It is the closest approach of the two axes. For nearly parallel axes that point is arbitrary.
-    So in crowded space, the point of another pair is taken instead, if it is well inside the field:
-    of one sensor of this pair and the first that it is paired with (longest baseline).
-
-    `middle` is that of `_middle`, `many` (s,) are the sensors in crowded space, and a, b (n,) the
-    pairs, the longest baseline first.
-    """
-    look, position, half = middle
-    range_a, _, _ = _closest_approach(position[b] - position[a], look[a], look[b])
-    reach = np.where(range_a > 0, np.minimum(range_a, farthest_km), farthest_km)
-    out = position[a] + reach[:, None] * look[a]
-    sensors, first = np.unique(np.column_stack([a, b]), return_index=True)
-    best = np.full((len(look), 3), np.nan)
-    best[sensors] = out[first // 2]
-    best[~many] = np.nan
-    for one, other in ((b, a), (a, b)):
-        toward = best[one] - position[other]
-        along = np.sum(toward * look[other], axis=1)
-        cosine = np.cos(MIDDLE_SHARE * half[other])
-        well_in = along > cosine * np.linalg.norm(toward, axis=1)  # false for NaN
-        out[well_in] = best[one][well_in]
-    return out
-
-
-def _shared_points(
-    middle: tuple[Array, Array, Array],
-    edges: Array,
-    a: Indices,
-    b: Indices,
-    farthest_km: float,
-) -> Array:
-    """Return (n, 8, 3): points [km] at the edges of fields a, where both fields of a pair see them.
-
-    A point lies on the line of an outermost tracklet of sensor a. It is the one that is nearest to
-    the axis of sensor b, or to an outermost tracklet of it, whichever passes most closely. NaN
-    where this is outside the field of b. `middle` and `edges` are those of `_middle`.
-    """
-    look, position, half = middle
-    best = np.full((len(a), N_EDGES), np.inf)
-    points = np.full((len(a), N_EDGES, 3), np.nan)
-    baseline = np.repeat(position[b] - position[a], N_EDGES, axis=0)
-    u = edges[a].reshape(-1, 3)
-    for towards in (*np.moveaxis(edges, 1, 0), look):
-        u_b = np.repeat(towards[b], N_EDGES, axis=0)
-        reach, beyond, miss = _closest_approach(baseline, u, u_b)
-        reach = np.minimum(reach, farthest_km)
-        with np.errstate(invalid="ignore"):
-            miss = np.where((reach > 0) & (beyond > 0), miss / reach, np.inf)
-        miss = miss.reshape(-1, N_EDGES)
-        nearer = miss < best
-        best[nearer] = miss[nearer]
-        at = position[a][:, None] + (reach[:, None] * u).reshape(-1, N_EDGES, 3)
-        points[nearer] = at[nearer]
-    toward = points - position[b][:, None]
-    along = np.einsum("npi,ni->np", toward, look[b])
-    inside = along > np.cos(half[b])[:, None] * np.linalg.norm(toward, axis=2)
-    return np.where(inside[..., None], points, np.nan)
-
-
-def _closest_approach(baseline: Array, u_a: Array, u_b: Array) -> tuple[Array, Array, Array]:
-    """Return the ranges [km] along two lines of their nearest points, and the gap [km]."""
-    cosine = np.sum(u_a * u_b, axis=1)
-    sine2 = np.maximum(1 - cosine**2, 1e-12)
-    along_a, along_b = np.sum(baseline * u_a, axis=1), np.sum(baseline * u_b, axis=1)
-    range_a = (along_a - cosine * along_b) / sine2
-    range_b = (cosine * along_a - along_b) / sine2
-    gap = baseline + range_b[:, None] * u_b - range_a[:, None] * u_a
-    return range_a, range_b, np.linalg.norm(gap, axis=1)
