@@ -253,13 +253,13 @@ def _settle_in(scratch, R, P, s_xy, s_z, centroids, stars, rule, matches):
     for step in range(8):
         turn_stars(R, stars.u, v)
         for k in range(n):
-            wide = 0.0
+            more2 = 0.0
             if step == 0:
                 off2 = u[k, 0] * u[k, 0] + u[k, 1] * u[k, 1]
-                wide = s_xy * s_xy + s_z * s_z * off2
+                more2 = s_xy * s_xy + s_z * s_z * off2
             elif step == 1:  # the first attitude may rest on a wrong match
-                wide = 2.0 * sigma[k] * sigma[k]
-            radius[k] = rule.gate * math.sqrt(sigma[k] * sigma[k] + wide)
+                more2 = 2.0 * sigma[k] * sigma[k]
+            radius[k] = rule.gate * math.sqrt(sigma[k] * sigma[k] + more2)
         match_stars(u, sigma, v, radius, matches, step > 1, owner, contested)
         _drop_odd(matches.star, centroids.instrumental, stars.magnitude, rule.zero_point)
         same, count = True, 0

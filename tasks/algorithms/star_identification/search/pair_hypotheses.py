@@ -312,8 +312,8 @@ def _judge(problem, beaten, R, P, row_of):
         same, matches = True, 0
         for k in range(n):
             if step > 0:
-                wide = 1.7 if step == 1 else 1.0
-                radius = min(rule.gate * sigma[k] * wide, stars.grid.radius_rad)
+                factor = 1.7 if step == 1 else 1.0
+                radius = min(rule.gate * sigma[k] * factor, stars.grid.radius_rad)
                 row_of[k], d2 = _look_up(R, centroids, k, radius, stars)
                 chi2_of[k] = d2 / (sigma[k] * sigma[k])
                 for j in range(k):  # one star, one centroid

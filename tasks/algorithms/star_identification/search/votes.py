@@ -80,12 +80,12 @@ def coarse_shift(n_votes, n_stars, tolerance):
 
 
 @borrowing_kernel
-def cell_of(star, turn, coarse):
-    """Return the cell of a star and a roll, 0 <= turn < `TURN`: its row of `Votes.cast`.
+def cell_of(star, roll, coarse):
+    """Return the cell of a star and a roll, 0 <= roll < `TURN`: its row of `Votes.cast`.
 
     The cells of a star follow each other. After the last one those of the next star begin.
     """
-    return ((star << TURN_BITS) + turn) >> coarse
+    return ((star << TURN_BITS) + roll) >> coarse
 
 
 @borrowing_kernel
@@ -197,14 +197,14 @@ def _vote(problem, i, m, coarse, votes):
 
 
 @borrowing_kernel
-def _cast(star, turn, wide, coarse, votes):
+def _cast(star, roll, wide, coarse, votes):
     """Count one vote for a star in each cell of roll that its tolerance touches.
 
-    `turn` and `wide` are the roll and its tolerance, in parts of `TURN`. `cast` and `reached` of
+    `roll` and its tolerance `wide` are in parts of `TURN`. `cast` and `reached` of
     `votes` are written.
     """
     first, last_bin = cell_of(star, 0, coarse), (TURN >> coarse) - 1
-    for k in range((turn - wide) >> coarse, ((turn + wide) >> coarse) + 1):
+    for k in range((roll - wide) >> coarse, ((roll + wide) >> coarse) + 1):
         cell = first + (k & last_bin)
         count = votes.cast[cell] + np.uint8(1)  # numba's sum has more than a byte
         if count > MAX_CELL_VOTES:
@@ -224,14 +224,14 @@ MIN_FINE_SHIFT = 4  # of the finest bins of roll: 4096 in a full turn
 class RefinedVotes(NamedTuple):
     """Votes that are counted again.
 
-    star, turn, wide : (n,) int64, the pivot's star, the roll and its tolerance, in parts of `TURN`
+    star, roll, wide : (n,) int64, the pivot's star, the roll and its tolerance, in parts of `TURN`
     pair, way, companion : (n,) int64, row of the pair table, which of its stars is the pivot's
         (0: the first), and the row of the companion in `Votes`
     bins : (bins,) int16, the votes of each bin
     """
 
     star: Integers
-    turn: Integers
+    roll: Integers
     wide: Integers
     pair: Integers
     way: Integers
@@ -274,14 +274,14 @@ def gather_votes(problem, i, n_companions, coarse, votes, min_votes, refined):
                     a, b, turn = pairs.first[p], pairs.second[p], int(pairs.at_first[p])
                 else:
                     a, b, turn = pairs.second[p], pairs.first[p], int(pairs.at_second[p])
-                turn = (turn - votes.angle[m]) & (TURN - 1)
-                if votes.cast[cell_of(a, turn, coarse)] < min_votes:
+                roll = (turn - votes.angle[m]) & (TURN - 1)
+                if votes.cast[cell_of(a, roll, coarse)] < min_votes:
                     continue
                 if contradicts_brightness(magnitude, a, b, m_i, m_j, m_ij, mag_gate):
                     continue
                 if n == MAX_REFINED:
                     return n + 1, 0
-                refined.star[n], refined.turn[n], refined.wide[n] = a, turn, votes.wide[m]
+                refined.star[n], refined.roll[n], refined.wide[n] = a, roll, votes.wide[m]
                 refined.pair[n], refined.way[n], refined.companion[n] = p, way, m
                 widest = max(widest, votes.wide[m])
                 n += 1
@@ -292,9 +292,13 @@ def gather_votes(problem, i, n_companions, coarse, votes, min_votes, refined):
 
 
 @borrowing_kernel
-def _bin_of(star, turn):
-    """Return the bin of a star and a bin of roll: a hash, with two numbers that mix them well."""
-    return (star * 40_503 + turn * 10_007) & ((1 << _BINS_LOG2) - 1)
+def _fine_bin(star, roll_bin, fine):
+    """Return the bin of a star and a bin of roll: a hash, with two numbers that mix them well.
+
+    `roll_bin`, a roll shifted by `fine`, may be beyond a full turn.
+    """
+    roll_bin &= (TURN >> fine) - 1
+    return (star * 40_503 + roll_bin * 10_007) & ((1 << _BINS_LOG2) - 1)
 
 
 @borrowing_kernel
@@ -308,15 +312,15 @@ def count_refined(n, fine, refined):
 @borrowing_kernel
 def add_vote(k, fine, times, refined):
     """Add `times` to each bin of vote k; -1 takes the vote back (compiled)."""
-    low, high = refined.turn[k] - refined.wide[k], refined.turn[k] + refined.wide[k]
-    for turn in range(low >> fine, (high >> fine) + 1):
-        refined.bins[_bin_of(refined.star[k], turn & ((TURN >> fine) - 1))] += np.int16(times)
+    low, high = refined.roll[k] - refined.wide[k], refined.roll[k] + refined.wide[k]
+    for roll_bin in range(low >> fine, (high >> fine) + 1):
+        refined.bins[_fine_bin(refined.star[k], roll_bin, fine)] += np.int16(times)
 
 
 @borrowing_kernel
 def agreeing(k, fine, refined):
     """Return the number of votes in the fullest bin of vote k (compiled)."""
-    low, high, most = refined.turn[k] - refined.wide[k], refined.turn[k] + refined.wide[k], 0
-    for turn in range(low >> fine, (high >> fine) + 1):
-        most = max(most, int(refined.bins[_bin_of(refined.star[k], turn & ((TURN >> fine) - 1))]))
+    low, high, most = refined.roll[k] - refined.wide[k], refined.roll[k] + refined.wide[k], 0
+    for roll_bin in range(low >> fine, (high >> fine) + 1):
+        most = max(most, int(refined.bins[_fine_bin(refined.star[k], roll_bin, fine)]))
     return most
