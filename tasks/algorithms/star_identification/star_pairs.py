@@ -14,10 +14,9 @@ from epipole.schemas.arrays import Array, Integers
 from epipole.tasks.algorithms.geometry.directions import tangent_basis
 from epipole.tasks.algorithms.kernels import borrowing_kernel
 
+# A full turn in units of a stored position angle: differences wrap by themselves.
 TURN_BITS = 16
-TURN = (
-    1 << TURN_BITS
-)  # a full turn in units of a stored position angle: differences wrap by themselves
+TURN = 1 << TURN_BITS
 # The reach of `NearStars` over the longest separation. A square field's stars lie within this of a
 # third of its other stars.
 NEAR_SHARE = 0.24
