@@ -20,7 +20,7 @@ from epipole.schemas.bridge import array, stack, stack_covariance
 from epipole.schemas.columns import TANGENT_AXES
 from epipole.schemas.spans import Span
 from epipole.schemas.work_tables import VIEWS
-from epipole.tasks.algorithms.association.samples import Samples
+from epipole.tasks.algorithms.association.samples import Samples, repeated_samples
 from epipole.tasks.algorithms.association.window_groups import Items
 from epipole.tasks.algorithms.geometry.directions import matrix_from_quaternion
 from epipole.tasks.algorithms.tracking.blends import BLEND_PX
@@ -402,7 +402,7 @@ class SampledViews:
         n_samples = seen.sum(axis=1)[item].astype(float)
         width_s = np.zeros((t, k))
         width_s[item, at] = self.width_s[rows]
-        repeated = _repeated(seen, (instants - instants[:1]) / 1e9, width_s)[item, at]
+        repeated = repeated_samples(seen, (instants - instants[:1]) / 1e9, width_s)[item, at]
         cov[item, at] = (
             repeated[:, None, None] * self.noise[rows] + n_samples[:, None, None] * self.bias[rows]
         )
@@ -437,25 +437,3 @@ def _means(values: Array, group: Indices, n: int) -> Array:
     count = np.bincount(group[known], minlength=n)
     total = np.bincount(group[known], values[known], n)
     return np.divide(total, count, out=np.full(n, np.nan), where=count > 0)
-
-
-def _repeated(seen: Flags, time_s: Array, width_s: Array) -> Array:
-    """Return how many samples of its tracklet each sample repeats, itself included, (t, k).
-
-    Samples that are fitted to the same detections share their errors. With this factor on the noise
-    of each, the shared detections count once.
-
-    Parameters
-    ----------
-    seen : (t, k) bool
-        Whether tracklet t has a sample at instant k.
-    time_s : (k,) float
-        The instants [s].
-    width_s : (t, k) float
-        Time that the detections of each sample span.
-    """
-    apart = np.abs(time_s[:, None] - time_s[None, :])
-    width = np.maximum((width_s[:, :, None] + width_s[:, None, :]) / 2, 1e-9)
-    shared = np.maximum(1 - apart / width, 0.0)
-    shared[:, np.arange(len(time_s)), np.arange(len(time_s))] = 1.0
-    return np.einsum("tij,tj->ti", shared, seen.astype(float))

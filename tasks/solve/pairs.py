@@ -77,8 +77,9 @@ def _position_error(groups: ViewGroups) -> Array:
 def _with_reference(groups: ViewGroups, candidates: Flags) -> tuple[Indices, Indices]:
     """Return each candidate's reference view, and the candidate."""
     error = np.where(candidates, _position_error(groups), np.inf)
-    order = np.lexsort((error, groups.group))
-    reference = order[groups.offsets[:-1]][groups.group]
+    least = np.flatnonzero(error == np.minimum.reduceat(error, groups.offsets[:-1])[groups.group])
+    first_least = least[np.searchsorted(least, groups.offsets[:-1])]
+    reference = first_least[groups.group]
     second = np.flatnonzero(candidates & (reference != np.arange(len(reference))))
     return reference[second], second
 

@@ -8,6 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from epipole.schemas.arrays import Array, Flags, Indices
+from epipole.tasks.algorithms.kernels import kernel
 
 FREE = -1  # the object of a tracklet that belongs to none
 
@@ -109,3 +110,35 @@ class InstantPoints(NamedTuple):
     normal: Array
     cov_km2: Array
     seen_by: Indices
+
+
+def repeated_samples(seen: Flags, time_s: Array, width_s: Array) -> Array:
+    """Return how many samples of its tracklet each sample repeats, itself included, (t, k).
+
+    Samples that are fitted to the same detections share their errors. With this factor on the noise
+    of each, the shared detections count once.
+
+    Parameters
+    ----------
+    seen : (t, k) bool
+        Whether tracklet t has a sample at instant k.
+    time_s : (k,) float
+        The instants [s].
+    width_s : (t, k) float
+        Time that the detections of each sample span.
+    """
+    out = np.empty(seen.shape)
+    _count_repeated(seen, np.array(time_s, float), np.array(width_s, float, order="C"), out)
+    return out
+
+
+@kernel
+def _count_repeated(seen, time_s, width_s, out):
+    """Write `repeated_samples` to `out` (t, k); the other arguments as there."""
+    for t in range(len(seen)):
+        for i in range(len(time_s)):
+            out[t, i] = 1.0 if seen[t, i] else 0.0
+            for j in range(len(time_s)):
+                if j != i and seen[t, j]:
+                    width = max((width_s[t, i] + width_s[t, j]) / 2, 1e-9)
+                    out[t, i] += max(1 - abs(time_s[i] - time_s[j]) / width, 0.0)
