@@ -160,7 +160,7 @@ def _grow(space, work, members, nearby):
     return n, n_near
 
 
-@borrowing_kernel
+@inlined_kernel
 def _join_others(space, work, members, nearby):
     """Give each sensor near the seed's points a turn, but not the two sensors of the seed.
 
