@@ -10,9 +10,9 @@ innermost loops that took longer than the computation. So a borrowing kernel mus
 (numba refuses to compile it), must not return one, and must not call a kernel that returns one:
 that array would never be freed. Slices and rows of the caller's arrays are allowed.
 
-An `inlined_kernel` is a borrowing kernel that becomes part of its caller. It is for kernels that
-take many arrays and have a single caller, which calls them for each frame: a call copies each
-array's address, shape and strides.
+An `inlined_kernel` is a borrowing kernel that becomes part of its callers. It is for kernels that
+take many arrays and have one or two callers, which call them for each frame or seed: a call copies
+each array's address, shape and strides.
 
 If a compiled kernel cannot be cached, because the disk is full, it is still used.
 """

@@ -77,7 +77,7 @@ def _position_error(groups: ViewGroups) -> Array:
 def _with_reference(groups: ViewGroups, candidates: Flags) -> tuple[Indices, Indices]:
     """Return each candidate's reference view, and the candidate."""
     error = np.where(candidates, _position_error(groups), np.inf)
-    least = np.flatnonzero(error == np.minimum.reduceat(error, groups.offsets[:-1])[groups.group])
+    least = np.flatnonzero(error == np.fmin.reduceat(error, groups.offsets[:-1])[groups.group])
     first_least = least[np.searchsorted(least, groups.offsets[:-1])]
     reference = first_least[groups.group]
     second = np.flatnonzero(candidates & (reference != np.arange(len(reference))))

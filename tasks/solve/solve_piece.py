@@ -118,10 +118,9 @@ def _rows(
 ) -> tuple[Indices, Indices]:
     """Return the rows of one sensor's views that show objects, and the object of each."""
     epoch_ns = array(views, "epoch")
-    first = dict(zip(tracklets["tracklet_id"].to_pylist(), array(tracklets, "first_view").tolist(),
-                     strict=True))  # fmt: skip
-    n_views = array(tracklets, "n_views")
-    count = dict(zip(first, n_views.tolist(), strict=True))
+    names = tracklets["tracklet_id"].to_pylist()
+    first = dict(zip(names, array(tracklets, "first_view").tolist(), strict=True))
+    count = dict(zip(names, array(tracklets, "n_views").tolist(), strict=True))
     rows, numbers = [np.zeros(0, np.int64)], [np.zeros(0, np.int64)]
     for name, number, start_ns, end_ns in members:
         if name not in first:

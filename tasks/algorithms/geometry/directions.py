@@ -214,11 +214,14 @@ def east_north(u: Array) -> Array:
 
 @kernel
 def _east_north(u, out):
-    """Write `east_north` of u (n, 3) to `out` (n, 2, 3); at a pole as for right ascension 0."""
+    """Write `east_north` of u (n, 3) to `out` (n, 2, 3).
+
+    At a pole the right ascension is that of `radec_from_unit`: 0, or half a turn for x = -0.0.
+    """
     for i in range(len(u)):
         x, y, z = u[i, 0], u[i, 1], u[i, 2]
         across = np.sqrt(x * x + y * y)
-        a, b = (-y / across, x / across) if across != 0.0 else (0.0, 1.0)
+        a, b = (-y / across, x / across) if across != 0.0 else (0.0, np.copysign(1.0, x))
         out[i, 0, 0], out[i, 0, 1], out[i, 0, 2] = a, b, 0.0
         out[i, 1, 0], out[i, 1, 1], out[i, 1, 2] = -z * b, z * a, x * b - y * a
 

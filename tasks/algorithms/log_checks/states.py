@@ -248,9 +248,9 @@ def _two_paths(states: LogStates) -> Finding:
 def _second_path(r_km: Array) -> Flags:
     """Return which states belong to a second path; none where one path is enough.
 
-    The first state that is far from the one before begins the second path. From there on each
-    belongs to the path whose last state is nearer. There are two paths only if they alternate:
-    after a gap in one path, all states are on the second.
+    The first state that is far from the one before begins the second path. From there on a state
+    that is far from the last one of its path belongs to the other one if that is nearer. There are
+    two paths only if they alternate: after a gap in one path, all states are on the second.
     """
     n = len(r_km)
     second = np.zeros(n, bool)

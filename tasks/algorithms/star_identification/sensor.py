@@ -320,7 +320,7 @@ def _first_scale(
 def _shares_of_rest(weights: Array, of_all: float) -> list[float]:
     """Return the share of what is left of a budget that each of n attempts may spend.
 
-    Together they may spend the part `of_all` of the budget, divided by their weights (n,). So
+    Together they may spend the part `of_all` of the budget, each in proportion to its weight. So
     attempt k may spend ``p[k] = of_all * weights[k] / weights.sum()`` of the whole budget. If those
     before it have spent all of theirs, ``1 - p[:k].sum()`` is left: its share is the ratio.
     """

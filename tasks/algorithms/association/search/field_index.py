@@ -6,8 +6,8 @@ where they share a cell, so the cost grows with the sensors per cell, not with a
 
 The cells are cubes of one size in a map of space, the grid. Directions from the Earth's centre are
 the same in both. A distance of r Earth radii is ln(r) + 1 in the grid; inside the Earth it is r.
-Cones and balls have lengths in km. `_cells_per_km` gives their lengths in the grid, over the size
-of a cell; `_centre_of` leads back from a cell to space.
+Cones and balls have lengths in km. Times `_cells_per_km` they are lengths in the grid, over the
+size of a cell; `_centre_of` leads back from a cell to space.
 
 1. `cones_of` gives the cone about each field.
 2. `field_index` enters the cones in cells, whose size it doubles until they fit.
@@ -387,7 +387,7 @@ def _enter_cell(cones, sweep, i, j, k, entering):
 
 @borrowing_kernel
 def _touches(cones, sweep, size, i, j, k):
-    """Return whether the centre of a cell is within half its diagonal of a cone.
+    """Return whether the centre of a cell is within half its diagonal of a cone that moves.
 
     The cell is (i, j, k) of those with this size; `cones` and `sweep` as in `_walk`.
     """

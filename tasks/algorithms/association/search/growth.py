@@ -319,13 +319,13 @@ def _settle(space, work, members, n):
 
 @borrowing_kernel
 def _review(space, work, members, n, n_early):
-    """Choose the members of the sensors of the first `n_early` again; return the size.
+    """Choose anew among the tracklets of the early members' sensors; return the size.
 
-    Changes `members` (t + 2,), of which the first n count. The early ones were chosen with points
-    from few views; now the points are well known. A false member does more harm than a miss. So a
-    tracklet joins only if it adds at least `MIN_GAIN`, and leads the sensor's next best one by
+    Changes `members` (t + 2,), of which the first n count. The first `n_early` were chosen with
+    points from few views; now the points are well known. A false member does more harm than a miss.
+    So a tracklet joins only if it adds at least `MIN_GAIN`, and leads the sensor's next best one by
     `MIN_LEAD` if that one adds as much. All other members stay if they still fit. If fewer than
-    `MIN_REVIEWED` - 1 are left, nothing is changed.
+    `MIN_REVIEWED` - 1 would be left, all stay that fit.
     """
     views, before, reviewed = space.views, work.before, next_mark(work.stamp)
     n_reviewed = _list_sensors(views, work, members[: min(n_early, n)], reviewed)

@@ -322,7 +322,7 @@ class RankedPairs(NamedTuple):
     points : (n, p, 3) float
         Points [km], GCRF, of the space that both share; NaN where there is no such point.
     share : (n,) float
-        Part of the half-angle of a field in which these points are covered.
+        A pair that seeds covers these points within this part of its fields' half-angles.
     waiting : (n,) bool, changed
         It has not seeded yet.
     covered : (n, p) int, changed
@@ -353,7 +353,7 @@ class SensorPairs:
     """Pairs of sensors that may see one object, in the order in which they should seed.
 
     Pairs with a longer baseline across the line of sight come first: they fix a point better and
-    give fewer false seeds. But every sensor takes part once before any takes part again.
+    give fewer false seeds. But they come in rounds, and no sensor takes part twice in a round.
     Pairs whose fields do not overlap are skipped. In crowded space each sensor is paired with a few
     only, see `meeting_pairs`.
 

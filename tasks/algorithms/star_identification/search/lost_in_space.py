@@ -238,9 +238,9 @@ def _gather_fullest(problem, i, n_companions, coarse, min_votes, max_cells, vote
 def _try_pivot(problem, i, order, min_companions, step, needed, votes, refined, scratch, best):
     """Try the hypotheses of pivot i with most votes; return the work done.
 
-    `order` (k,) int64 are rows of the centroids, as in `count_votes`, `step` is a row of `ROUNDS`,
-    and `needed` from `matches_needed`. `votes`, `refined` and `scratch` are work space; `best`, a
-    `Best`, is updated.
+    `order` (k,) int64 are rows of the centroids, as in `count_votes`, `step` the number of a row
+    of `ROUNDS`, and `needed` from `matches_needed`. `votes`, `refined` and `scratch` are work
+    space; `best`, a `Best`, is updated.
     """
     enough_votes, max_cells = ROUNDS[step][3], ROUNDS[step][4]
     n_companions, n_cast, coarse = count_votes(

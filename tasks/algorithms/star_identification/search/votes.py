@@ -118,7 +118,7 @@ def companion(centroids, i, j, min_chord):
 def implied_magnitudes(problem, i, j):
     """Return the magnitudes that the fluxes of two centroids imply, and i's less j's (compiled).
 
-    All are NaN where a flux is unknown; the magnitudes too while the zero point is.
+    What needs an unknown flux is NaN, and so are the magnitudes while the zero point is unknown.
     """
     instrumental, zero_point = problem.centroids.instrumental, problem.rule.zero_point
     m_i, m_j = instrumental[i] + zero_point, instrumental[j] + zero_point
@@ -141,8 +141,10 @@ def contradicts_brightness(magnitude, a, b, m_i, m_j, m_ij, mag_gate):
 
 @borrowing_kernel
 def possible_ways(m_ij, mag_gate):
-    """Return whether the pivot may be the first, brighter star of a pair, and whether the second,
-    by its magnitude less that of its companion (compiled)."""
+    """Return whether the pivot may be the first, brighter star of a pair, and whether the second.
+
+    m_ij [mag] is the pivot's magnitude less its companion's (compiled).
+    """
     return not m_ij > 1.414 * mag_gate, not m_ij < -1.414 * mag_gate
 
 

@@ -12,6 +12,7 @@ from epipole.tasks.algorithms.constants import SPEED_OF_LIGHT_KM_S
 from epipole.tasks.algorithms.geometry.directions import (
     aberrate,
     boresight_angles,
+    east_north,
     radec_from_unit,
     tangent_basis,
     unit_from_radec,
@@ -67,6 +68,16 @@ def test_the_tangent_basis_is_a_right_handed_triad(seed):
         triad @ np.swapaxes(triad, 1, 2), np.eye(3)[None].repeat(16, 0), atol=1e-14
     )
     np.testing.assert_allclose(np.linalg.det(triad), 1.0)
+
+
+@pytest.mark.parametrize("x", [0.0, -0.0])
+@pytest.mark.parametrize("pole", [1.0, -1.0])
+def test_at_a_pole_east_and_north_go_with_the_right_ascension(x, pole):
+    u = np.array([[x, 0.0, pole]])
+    ra, _ = radec_from_unit(u)
+    east, north = east_north(u)[0]
+    np.testing.assert_allclose(east, [-np.sin(ra[0]), np.cos(ra[0]), 0.0], atol=1e-15)
+    np.testing.assert_allclose(np.cross(east, north), u[0], atol=1e-15)
 
 
 @settings(deadline=None)
