@@ -16,7 +16,7 @@ import numpy as np
 
 from epipole.schemas.arrays import Array
 from epipole.tasks.algorithms.constants import EARTH_RADIUS_KM, GM_KM3_S2, J2
-from epipole.tasks.algorithms.kernels import kernel
+from epipole.tasks.algorithms.kernels import borrowing_kernel, kernel
 
 LOWEST_ORBIT_KM = EARTH_RADIUS_KM + 80.0  # below, air or ground carries a vehicle: no free fall
 
@@ -36,13 +36,24 @@ def _pull(r, out):
     """Write `gravity` at r (n, 3) [km] to `out` (n, 3)."""
     for i in range(len(r)):
         x, y, z = r[i, 0], r[i, 1], r[i, 2]
-        r2 = x * x + y * y + z * z
-        pull = -GM_KM3_S2 / (r2 * np.sqrt(r2)) if r2 > LOWEST_ORBIT_KM**2 else 0.0
-        oblate = 1.5 * J2 * EARTH_RADIUS_KM**2 / r2
-        tilt = 5.0 * z * z / r2
-        level = pull * (1.0 + oblate * (1.0 - tilt))
-        out[i, 0], out[i, 1] = x * level, y * level
-        out[i, 2] = z * pull * (1.0 + oblate * (3.0 - tilt))
+        r2, pull, across, along = _terms(x, y, z)
+        pull = pull if r2 > LOWEST_ORBIT_KM**2 else 0.0
+        out[i, 0], out[i, 1] = x * (-pull * across), y * (-pull * across)
+        out[i, 2] = -pull * z * along
+
+
+@borrowing_kernel
+def _terms(x0, x1, x2):
+    """Return the terms of gravity at a position [km], GCRF.
+
+    The squared distance [km^2]; the pull of a point mass over the distance [1/s^2]; and the factors
+    of the flattening on it, across the Earth's axis and along it.
+    """
+    r2 = x0 * x0 + x1 * x1 + x2 * x2
+    oblate = 1.5 * J2 * EARTH_RADIUS_KM**2 / r2
+    tilt = 5.0 * x2 * x2 / r2
+    pull = GM_KM3_S2 / (r2 * np.sqrt(r2))
+    return r2, pull, 1.0 + oblate * (1.0 - tilt), 1.0 + oblate * (3.0 - tilt)
 
 
 def propagate_states(r_km: Array, v_km_s: Array, dt_s: Array, steps: int) -> tuple[Array, Array]:
@@ -74,14 +85,11 @@ def _rates(y, out):
     y is (6,) or (42,); `out` may be longer, and its other elements stay.
     """
     x0, x1, x2 = y[0], y[1], y[2]
-    r2 = x0 * x0 + x1 * x1 + x2 * x2
-    pull = GM_KM3_S2 / (r2 * np.sqrt(r2))
-    oblate = 1.5 * J2 * EARTH_RADIUS_KM**2 / r2
-    tilt = 5.0 * x2 * x2 / r2
-    level = -pull * (1.0 + oblate * (1.0 - tilt))
+    r2, pull, across, along = _terms(x0, x1, x2)
+    level = -pull * across
     out[0], out[1], out[2] = y[3], y[4], y[5]
     out[3], out[4] = x0 * level, x1 * level
-    out[5] = -pull * x2 * (1.0 + oblate * (3.0 - tilt))
+    out[5] = -pull * x2 * along
     if len(y) == 6:
         return
     # The matrix neglects the oblateness: a thousandth of its elements.

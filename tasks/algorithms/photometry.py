@@ -11,6 +11,7 @@ import numpy as np
 from scipy.optimize import nnls
 
 from epipole.schemas.arrays import Array, Indices
+from epipole.tasks.algorithms.kernels import kernel
 
 MIN_VALUES = 20  # minimum number of residuals for an estimate of the variance
 MIN_PER_BIN = 25  # minimum number of residuals per bin of flux
@@ -68,7 +69,7 @@ def flux_scale(
     frame, star, magnitude = frame[usable], star[usable], magnitude[usable]
     offset = magnitude + 2.5 * np.log10(flux[usable])
     count = np.bincount(frame, minlength=n_frames)
-    zero = _medians(frame, offset, n_frames)
+    zero = medians(frame, offset, n_frames)
     # The expected flux: a star with a wrong flux must not be among the bright ones.
     flux = 10 ** (-0.4 * (magnitude - zero[frame]))
     of_star = (UNKNOWN_STAR_MAG2, 0.0)
@@ -125,16 +126,24 @@ def _with_others(residual: Array, flux: Array, count: Indices) -> tuple[Array, A
     return residual[others] * np.sqrt(n / (n - 1)), flux[others]
 
 
-def _medians(group: Indices, value: Array, n: int) -> Array:
+def medians(group: Indices, value: Array, n: int) -> Array:
     """Return the median of the values of each of n groups, (n,); NaN for a group without values."""
-    order = np.lexsort((value, group))
-    count = np.bincount(group, minlength=n)
-    first = np.cumsum(count) - count
-    low, high = first + (count - 1) // 2, first + count // 2
-    sorted_values = np.append(value[order], np.nan)
-    last = len(value)
-    low, high = (np.where(count > 0, at, last) for at in (low, high))
-    return np.asarray((sorted_values[low] + sorted_values[high]) / 2)
+    order = np.argsort(group, kind="stable")
+    first = np.searchsorted(group[order], np.arange(n + 1))
+    out = np.full(n, np.nan)
+    _write_medians(first, value[order].astype(float), out)
+    return out
+
+
+@kernel
+def _write_medians(first, value, out):
+    """Write the median of the values first[k]:first[k + 1] of `value` (m,) to row k of `out` (n,).
+
+    `first` is (n + 1,). A row without values is not written.
+    """
+    for k in range(len(out)):
+        if first[k + 1] > first[k]:
+            out[k] = np.median(value[first[k] : first[k + 1]])
 
 
 def _variance_by_flux(residual: Array, flux: Array) -> tuple[float, float]:

@@ -98,7 +98,7 @@ class _Member(NamedTuple):
 
 
 def _by_sensor(members: pa.Table, time: Span) -> Iterator[tuple[int, list[_Member]]]:
-    """Yield each sensor with its members of OBJECT_MEMBERS within a time, in their order."""
+    """Yield each sensor with its OBJECT_MEMBERS, in their order, their epochs cut to a time."""
     sensor = array(members, "sensor")
     columns = (
         members["tracklet_id"].to_pylist(),

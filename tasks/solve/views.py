@@ -141,10 +141,7 @@ def _view_table(
     u_sensor = np.einsum("nij,nj->ni", R, aberrate(u, v[frame]))
     x_px, y_px = project(camera, u_sensor)
     r_km, v_km_s = states_near_frames(frames, frame, array(epochs, "dt_s")[row])
-    cov_noise, cov_bias = (
-        on_tangent_plane(u, motion.cov_noise),
-        on_tangent_plane(u, motion.cov_bias),
-    )
+    cov_noise, cov_bias = (on_tangent_plane(u, c) for c in (motion.cov_noise, motion.cov_bias))
     cov_noise, cov_bias, blend_rad2 = _without_blends(tracklet, cov_noise, cov_bias)
     turn = np.where(frames.from_stars[frame], 0.0, traces(cov_bias))
     if sightings.cov_optics.any():

@@ -58,7 +58,7 @@ def canonical(q: Array) -> Array:
 
 def quaternion_from_rotation_vector(v: Array) -> Array:
     """Return (..., 4) quaternions of (..., 3) rotation vectors [rad]."""
-    angle = np.linalg.norm(v, axis=-1, keepdims=True)
+    angle = lengths(v)[..., None]
     # sinc keeps the limit at zero angle: sin(a/2)/a = sinc(a/2pi)/2
     return np.concatenate([v * 0.5 * np.sinc(angle / (2 * np.pi)), np.cos(angle / 2)], axis=-1)
 
@@ -66,7 +66,7 @@ def quaternion_from_rotation_vector(v: Array) -> Array:
 def rotation_vector_from_quaternion(q: Array) -> Array:
     """Return (..., 3) rotation vectors [rad], angle in [0, pi], of (..., 4) quaternions."""
     q = canonical(q)
-    sine = np.linalg.norm(q[..., :3], axis=-1, keepdims=True)
+    sine = lengths(q[..., :3])[..., None]
     angle = 2 * np.arctan2(sine, q[..., 3:])
     with np.errstate(invalid="ignore", divide="ignore"):
         factor = np.where(sine > 1e-12, angle / sine, 2.0)
@@ -110,39 +110,8 @@ def interpolate_quaternions(times: Array, q: Array, at: Array) -> Array:
         return np.repeat(canonical(q), len(at), axis=0)
     i = np.clip(np.searchsorted(times, at) - 1, 0, len(times) - 2)
     share = (at - times[i]) / (times[i + 1] - times[i])
-    out = np.empty((len(i), 4))
-    _interpolate(np.array(q, float, order="C"), i, share, out)
-    return out
-
-
-@kernel
-def _interpolate(q, row, share, out):
-    """Write the attitude at a share of the turn from row i to row i + 1 of q (n, 4) to `out`.
-
-    `row` (m,), `share` (m,), `out` (m, 4), canonical.
-    """
-    turn = np.empty(4)
-    for k in range(len(row)):
-        a, b = q[row[k]], q[row[k] + 1]
-        turn[0] = b[0] * a[3] - b[3] * a[0] - b[1] * a[2] + b[2] * a[1]
-        turn[1] = b[1] * a[3] - b[3] * a[1] - b[2] * a[0] + b[0] * a[2]
-        turn[2] = b[2] * a[3] - b[3] * a[2] - b[0] * a[1] + b[1] * a[0]
-        turn[3] = b[3] * a[3] + b[0] * a[0] + b[1] * a[1] + b[2] * a[2]
-        if turn[3] < 0.0:
-            turn *= -1.0
-        sine = np.sqrt(turn[0] * turn[0] + turn[1] * turn[1] + turn[2] * turn[2])
-        half = share[k] * np.arctan2(sine, turn[3])
-        # The sine of a share of a small angle is the share of the sine.
-        turn[:3] *= np.sin(half) / sine if sine > 1e-12 else share[k]
-        turn[3] = np.cos(half)
-        out[k, 0] = turn[3] * a[0] + turn[0] * a[3] + turn[1] * a[2] - turn[2] * a[1]
-        out[k, 1] = turn[3] * a[1] + turn[1] * a[3] + turn[2] * a[0] - turn[0] * a[2]
-        out[k, 2] = turn[3] * a[2] + turn[2] * a[3] + turn[0] * a[1] - turn[1] * a[0]
-        out[k, 3] = turn[3] * a[3] - turn[0] * a[0] - turn[1] * a[1] - turn[2] * a[2]
-        size = 0.0
-        for m in range(4):
-            size += out[k, m] * out[k, m]
-        out[k] /= np.sqrt(size) if out[k, 3] >= 0.0 else -np.sqrt(size)
+    turn = rotation_vector_from_quaternion(multiply(q[i + 1], conjugate(q[i])))
+    return canonical(multiply(quaternion_from_rotation_vector(turn * share[:, None]), q[i]))
 
 
 # Directions

@@ -70,13 +70,10 @@ def _unknowns(sensors: Indices) -> Indices:
 def _summed(entries: Sequence[Entries], n_sensors: int) -> csr_array:
     """Return the sparse matrix of all sensors; entries of one row and column are added."""
     n = N_SHARED * n_sensors
-    if sum(len(values) for _, _, values in entries) > n * n:  # sparse, it takes more than dense
-        dense = np.zeros(n * n)
-        for rows, columns, values in entries:
-            dense += np.bincount(n * rows + columns, values, n * n)
-        return csr_array(dense.reshape(n, n))
     empty = np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros(0)
     rows, columns, values = (np.concatenate(of) for of in zip(empty, *entries, strict=True))
+    if len(values) > n * n:  # to sort them takes longer than a dense matrix
+        return csr_array(np.bincount(n * rows + columns, values, n * n).reshape(n, n))
     return csr_array(coo_array((values, (rows, columns)), (n, n)))
 
 

@@ -14,6 +14,7 @@ import numpy as np
 from epipole.schemas.arrays import Array, Flags, Indices
 from epipole.tasks.algorithms.geometry.covariances import traces
 from epipole.tasks.algorithms.kernels import kernel
+from epipole.tasks.algorithms.photometry import medians
 from epipole.tasks.algorithms.tracking.local_motion import directions_at
 from epipole.tasks.algorithms.tracking.sky_filter import BEND_SHARE, acceleration
 
@@ -151,19 +152,9 @@ def _ends_of(tracked: TrackedDetections) -> _TrackletEnds:
 
 def _usual_flux(tracked: TrackedDetections, blended: Flags) -> Array:
     """Return the median flux of each tracklet's unblended detections; NaN if unknown."""
-    out = np.full(len(tracked.bounds) - 1, np.nan)
-    known = ~blended & np.isfinite(tracked.flux)
-    _medians(tracked.bounds, np.ascontiguousarray(tracked.flux), known, out)
-    return out
-
-
-@kernel
-def _medians(bounds, values, known, out):
-    """Write the median of each tracklet's known values (n,) to `out` (t,); `bounds` (t + 1,)."""
-    for k in range(len(out)):
-        some = values[bounds[k] : bounds[k + 1]][known[bounds[k] : bounds[k + 1]]]
-        if len(some):
-            out[k] = np.median(some)
+    n, known = len(tracked.bounds) - 1, ~blended & np.isfinite(tracked.flux)
+    tracklet = np.repeat(np.arange(n), np.diff(tracked.bounds))
+    return medians(tracklet[known], tracked.flux[known], n)
 
 
 @kernel

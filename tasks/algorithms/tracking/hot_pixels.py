@@ -290,10 +290,8 @@ def _find_positions(
         index = row * width + column
         order = np.argsort(index, kind="stable")
         ordered = index[order]
-        left = ordered[~taken[order]]
-        first = np.flatnonzero(np.append(True, left[1:] != left[:-1])[: len(left)])
-        count = np.diff(np.append(first, len(left)))
-        for full in left[first[count >= max(MIN_SHARE * n_frames, MIN_FRAMES)]].tolist():
+        cells, count = np.unique(index[~taken], return_counts=True)
+        for full in cells[count >= max(MIN_SHARE * n_frames, MIN_FRAMES)].tolist():
             inside = _in_cells(order, ordered, full, full)
             inside = inside[~taken[inside]]
             if not len(inside):  # they belong to a position in a neighbouring cell
