@@ -100,15 +100,23 @@ def check_states(states: LogStates) -> list[Finding]:
 def _readings(arcs: Sequence[Arc], earth_fixed: bool) -> tuple[float, list[Finding]]:
     """Return the unit of positions [km], and the findings on unit, frame and velocities."""
     stated = fit_reading(arcs, stated_reading(earth_fixed))
-    find_others = all_readings if stated.misfit > FAR else main_readings
-    others = [fit_reading(arcs, reading) for reading in find_others(stated.reading)]
+    others = _others(arcs, stated)
     best = _chosen(stated, others)
     velocity = check_velocities(best.arcs)
     if velocity.verdict == SOUND:
-        stated, others = with_velocities(stated), [with_velocities(fit) for fit in others]
+        were_far, stated = stated.misfit > FAR, with_velocities(stated)
+        if stated.misfit > FAR and not were_far:
+            others = _others(arcs, stated)
+        others = [with_velocities(fit) for fit in others]
         best = _chosen(stated, others)
     findings = [_unit(stated, others, best), _frame(stated, others, best), velocity]
     return best.reading.scale, findings
+
+
+def _others(arcs: Sequence[Arc], stated: ReadingFit) -> list[ReadingFit]:
+    """Return the fits of other readings: of all where the stated one is far off."""
+    find_others = all_readings if stated.misfit > FAR else main_readings
+    return [fit_reading(arcs, reading) for reading in find_others(stated.reading)]
 
 
 def _chosen(stated: ReadingFit, others: Sequence[ReadingFit]) -> ReadingFit:
