@@ -14,8 +14,10 @@
    more pairs are needed: back to 2.
 6. The remaining hypotheses become groups, the likeliest first (`_Search.take`). Two that follow
    each other in time may be merged. Tracklets that two explain about equally well are ambiguous.
-7. A tracklet goes to the group that clearly explains it best (`search.resolve_conflicts`).
-8. Groups that are doubtful, now that the number of objects is known, are withdrawn.
+7. With many sensors, the tracklets that are left are seeds too, where no pair of 2 has looked
+   (`search.leftover_seeds`).
+8. A tracklet goes to the group that clearly explains it best (`search.resolve_conflicts`).
+9. Groups that are doubtful, now that the number of objects is known, are withdrawn.
 """
 
 from collections.abc import Iterable
@@ -42,12 +44,14 @@ from epipole.tasks.algorithms.association.hypothesis_queue import (
 from epipole.tasks.algorithms.association.samples import FREE, Groups, Samples
 from epipole.tasks.algorithms.association.search.field_index import cones_of, field_index
 from epipole.tasks.algorithms.association.search.growth import grow_all
+from epipole.tasks.algorithms.association.search.leftover_seeds import leftover_seeds
 from epipole.tasks.algorithms.association.search.merge_hypotheses import best_merger
 from epipole.tasks.algorithms.association.search.resolve_conflicts import resolve_conflicts
 from epipole.tasks.algorithms.association.search.search_space import SearchSpace, work_space
 from epipole.tasks.algorithms.association.search.seeds import seeds_between
 from epipole.tasks.algorithms.association.search.sensor_pairs import (
     EveryPair,
+    RankedPairs,
     SensorPairs,
     sparse_sensors,
 )
@@ -171,6 +175,8 @@ class _Search:
             # If sensors miss more than was assumed, more pairs are needed.
             waiting = self._learn_detection(waiting)
         self.take(waiting, MIN_KEPT_LOG_ODDS)
+        if isinstance(pairs, SensorPairs):
+            self._take_leftover(pairs.ranked)
         nothing_taken = self.space._replace(taken=np.zeros_like(self.space.taken))
         x_km = np.array([h.x_km for h in self.groups]).reshape(-1, 3)
         resolve_conflicts(nothing_taken, self.work, self.group, x_km)
@@ -188,6 +194,11 @@ class _Search:
         """
         missed = 1 - float(np.mean(self.space.chance.detected)) ** 2
         return float(np.ceil(np.log(MAX_UNSEEDED / max(len(self.groups), 1)) / np.log(missed)))
+
+    def _take_leftover(self, pairs: RankedPairs) -> None:
+        """Accept groups of tracklets that are left, of pairs of sensors that were skipped."""
+        seeds = leftover_seeds(self.space, pairs, self._enough_pairs(), self.space.gate_sigma)
+        self.take(distinct(self.grow(seeds)[0]), MIN_KEPT_LOG_ODDS)
 
     def hypotheses(self, a: int, b: int) -> list[Hypothesis]:
         """Return the hypotheses of two sensors' seeds; clear ones become groups at once."""

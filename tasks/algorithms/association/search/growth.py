@@ -180,10 +180,10 @@ def _join_others(space, work, members, nearby):
         return np.int64(0), n_near, n_early
     a, b = views.sensor[members[0]], views.sensor[members[1]]
     work.stamp[a] = work.stamp[b] = had_turn
-    first = np.searchsorted(near[:n_near], a)
     evidence, n_looked = 0.0, 0  # log-odds that the sensors add, and how many should detect it
-    nearest2 = nearest_range2(views, members[:n], work.points)
     while True:
+        first = np.searchsorted(near[:n_near], a)
+        nearest2 = nearest_range2(views, members[:n], work.points)
         for turn in range(n_near):
             s = near[(first + turn) % n_near]
             if work.stamp[s] == had_turn:

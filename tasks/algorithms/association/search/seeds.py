@@ -46,7 +46,7 @@ def seeds_between(space, a, b, gate_sigma):
             reach = gate * np.sqrt(sigma_a[q] ** 2 + max_sigma**2)
             k = np.searchsorted(angle_b, angle_a[q] - reach)
             while k < len(items_b) and angle_b[k] <= angle_a[q] + reach:
-                if _meet(space, items_a[q], items_b[k], m, gate_sigma, axes):
+                if meet(space, items_a[q], items_b[k], m, gate_sigma, axes):
                     if n == len(out):
                         longer = np.empty((2 * n, 2), np.int64)
                         longer[:n] = out
@@ -64,7 +64,7 @@ def _size(views, s):
 
 
 @borrowing_kernel
-def _meet(space, i, j, m, gate_sigma, work):
+def meet(space, i, j, m, gate_sigma, work):
     """Return whether two tracklets meet at all instants they share, of which m is the first.
 
     `work` (2, 3) is work space: `axes` is written again for each instant.

@@ -371,8 +371,8 @@ class SensorPairs:
         a, b = _together((a[dense], b[dense]), passing, n_sensors)
         a, b = _longest_first(fields, a, b)
         self._index, self._fields = index, fields
-        self._pairs = _ranked_pairs(fields, crowded, sparse, a, b, farthest_km)
-        self._by_cell = _points_by_cell(index, self._pairs.points)
+        self.ranked = _ranked_pairs(fields, crowded, sparse, a, b, farthest_km)
+        self._by_cell = _points_by_cell(index, self.ranked.points)
         self._busy = np.zeros(n_sensors, bool)  # sensors that have taken part in this round
         self._next = 0  # the pair at which the search for the next one begins
 
@@ -382,7 +382,7 @@ class SensorPairs:
         A pair is skipped where `enough` of the earlier pairs cover each point that it shares.
         These points are in the middle of the shared space and, if it is not crowded, at its edges.
         """
-        pairs = self._pairs
+        pairs = self.ranked
         k = _next_pair(pairs, self._busy, float(enough), self._next)
         if k < 0:
             self._busy[:] = False

@@ -81,6 +81,27 @@ def pair_miss(views, i, j, m, lowest, farthest, ui, uj):
 
 
 @borrowing_kernel
+def meeting_point(views, i, j, m, work, x):
+    """Write to x (3,) [km], GCRF, the point of line i that is nearest to line j, at instant m.
+
+    The lines of sight of two tracklets meet, see `pair_miss`; `work` (2, 3) is work space.
+    """
+    ui, uj = work[0], work[1]
+    direction(views, i, m, ui)
+    direction(views, j, m, uj)
+    cosine, along_i, along_j = 0.0, 0.0, 0.0
+    for a in range(3):
+        x[a] = views.camera[views.sensor[i], m, a]
+        baseline = views.camera[views.sensor[j], m, a] - x[a]
+        cosine += ui[a] * uj[a]
+        along_i += baseline * ui[a]
+        along_j += baseline * uj[a]
+    reach = (along_i - cosine * along_j) / (1.0 - cosine * cosine)
+    for a in range(3):
+        x[a] += reach * ui[a]
+
+
+@borrowing_kernel
 def _speed(views, i, m, range_km, n0, n1, n2):
     """Return the object's velocity [km/s] along a unit vector, from the rate of tracklet i.
 

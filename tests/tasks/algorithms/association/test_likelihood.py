@@ -18,6 +18,35 @@ def test_objects_are_found_among_strays(n_sensors):
     assert recall > 0.97
 
 
+@pytest.mark.parametrize("n_sensors", [8, 16])
+@pytest.mark.parametrize("seed", range(4))
+def test_an_object_in_the_corners_of_two_fields_only_is_found_among_many_sensors(seed, n_sensors):
+    """The pairs of sensors that seed what all see may not cover these corners."""
+    scene, path, sees = in_two_corners(seed, n_sensors)
+    for s in sees:
+        scene.add(s, 99, path[s] / np.linalg.norm(path[s], axis=1, keepdims=True))
+    group = solve(scene.samples()).group[np.array(scene.who) == 99]
+    assert group[0] == group[1] >= 0
+
+
+def in_two_corners(seed, n_sensors):
+    """Return a scene of objects, a path 1.2 degrees from their middle as each sensor sees it, and
+    the two sensors that have it in their field."""
+    for again in range(200):
+        scene = Scene(1000 * seed + again, n_sensors).objects(12, spread_km=400.0)
+        off = scene.rng.normal(size=3)
+        off -= off @ GEO / (GEO @ GEO) * GEO
+        start = GEO + np.radians(1.2) * 35500.0 * off / np.linalg.norm(off)
+        path = start + scene.times[:, None] * V_GEO - scene.r
+        samples = scene.samples()
+        seen = np.einsum("skij,skj->ski", samples.R_sensor_from_icrs, path)
+        edge = 0.98 * samples.half_field[:, None] * seen[..., 2:]
+        sees = np.flatnonzero((np.abs(seen[..., :2]) < edge).all(axis=(1, 2)))
+        if len(sees) == 2:
+            return scene, path, sees
+    raise AssertionError("no such scene")
+
+
 def test_two_sensors_suffice_where_strays_are_few():
     scene = Scene(1, 2).objects(5).strays(2)
     precision, recall = judge(scene, solve(scene.samples()))
