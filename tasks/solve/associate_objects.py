@@ -168,13 +168,14 @@ def _associate_longer(
     agreeing: Flags,
     settings: AssociationSettings,
 ) -> None:
-    """Associate tracklets again over longer windows: undecided ones, and those of groups in which
-    a tracklet is not with the object that it mostly is."""
+    """Associate tracklets again over longer windows: undecided ones, and those of groups that
+    another window contradicts."""
     window_before_s = settings.window_s
     for window_s in LONGER_WINDOWS_S:
         if not window_before_s < window_s <= settings.max_window_s:
             continue
         window_groups.doubt(_changing(block, window_groups.group, windows))
+        window_groups.doubt(window_groups.contradicted(BRIEFLY * settings.window_s))
         longer = block.items.first_ns // round(window_s * 1e9)
         for number in np.unique(longer[agreeing]).tolist():
             rows = np.flatnonzero((longer == number) & agreeing)
@@ -184,6 +185,7 @@ def _associate_longer(
                 groups = _find_groups(block, samples, settings)
                 window_groups.reconsider(rows, again, tracklet, groups)
         window_before_s = window_s
+    window_groups.withdraw(window_groups.contradicted(BRIEFLY * settings.window_s))
 
 
 def _changing(block: BlockViews, group: Indices, windows: list[Indices]) -> Indices:

@@ -70,6 +70,38 @@ class WindowGroups:
         groups = self.group[rows]
         self._score[groups[groups != FREE]] = -np.inf
 
+    def contradicted(self, briefly_s: float) -> Indices:
+        """Return the items of groups of two tracklets that fit no object in another window.
+
+        There both are seen for longer than `briefly_s` [s]. Two sensors and two objects in nearly
+        one plane may agree by far in one half minute, and not at all in the next.
+        """
+        items = self.items
+        alone = (self.group == FREE) & ~self.undecided & ~self.ambiguous
+        alone = np.flatnonzero(alone & (items.last_ns - items.first_ns > briefly_s * 1e9))
+        alone = alone[np.argsort(items.tracklet[alone], kind="stable")]
+        tracklet, window = items.tracklet[alone], items.window[alone]
+        pairs = self._pairs()
+        begin = np.searchsorted(tracklet, items.tracklet[pairs])
+        end = np.searchsorted(tracklet, items.tracklet[pairs], side="right")
+        found = np.zeros(len(pairs), bool)
+        for k in np.flatnonzero((begin < end).all(axis=1)).tolist():
+            one, other = (window[begin[k, c] : end[k, c]] for c in range(2))
+            found[k] = np.isin(one, other).any()
+        return pairs[found].ravel()
+
+    def _pairs(self) -> Indices:
+        """Return the items of each group of two, (n, 2)."""
+        rows = np.flatnonzero(self.group != FREE)
+        rows = rows[np.argsort(self.group[rows], kind="stable")]
+        _, first, size = np.unique(self.group[rows], return_index=True, return_counts=True)
+        return np.asarray(rows[first[size == 2][:, None] + np.arange(2)])
+
+    def withdraw(self, rows: Indices) -> None:
+        """Let some items be undecided instead of in their group."""
+        self.group[rows] = FREE
+        self.undecided[rows] = True
+
     def continue_groups(self, allowed: Flags, briefly_s: float) -> None:
         """Let the tracklets of a group stay together in neighbouring windows.
 

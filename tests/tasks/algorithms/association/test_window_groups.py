@@ -158,3 +158,39 @@ def test_without_items_nothing_goes_on():
     verdicts = WindowGroups(Items(*np.zeros((6, 0), np.int64)))
     verdicts.continue_groups(np.zeros(0, bool), BRIEFLY_S)
     assert not len(verdicts.group)
+
+
+@pytest.mark.parametrize(
+    ("brief", "state", "doubted"),
+    [
+        ([], None, True),
+        ([1], None, False),  # seen for 4 s there: too short to fit
+        ([], "undecided", False),  # they fit there, with too little evidence
+        ([], "ambiguous", False),
+    ],
+)
+def test_a_group_of_two_that_fits_no_object_in_another_window_is_contradicted(
+    brief, state, doubted
+):
+    verdicts = entered(score=20.0)
+    items = verdicts.items
+    items.last_ns[2:] -= np.where(np.isin(items.tracklet[2:], brief), 16_000_000_000, 0)
+    if state:
+        getattr(verdicts, state)[2:] = True
+    assert verdicts.contradicted(BRIEFLY_S).tolist() == ([0, 1] if doubted else [])
+
+
+def test_groups_of_three_are_not_contradicted():
+    window, tracklet = np.repeat([0, 1], 3), np.tile([0, 1, 2], 2)
+    first_ns = window * 30_000_000_000
+    items = Items(window, tracklet, tracklet, first_ns, first_ns + 20_000_000_000, np.full(6, 3))
+    verdicts = WindowGroups(items)
+    verdicts.enter(np.arange(3), np.arange(3), group_of(3, 20.0))
+    assert not len(verdicts.contradicted(BRIEFLY_S))
+
+
+def test_what_is_withdrawn_is_undecided():
+    verdicts = entered(score=20.0)
+    verdicts.withdraw(np.arange(2))
+    assert (verdicts.group == -1).all()
+    assert verdicts.undecided.tolist() == [True, True] + [False] * 8
