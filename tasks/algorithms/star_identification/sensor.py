@@ -300,8 +300,8 @@ def _first_scale(
     """
     attempts = _attempts(probe.centroids, skies, model, scales, crowded)
     matching = model.matching
-    # Each further attempt is one more chance of a false alarm.
-    threshold = matching.threshold + np.log(max(len(attempts) - 1, 1))
+    # Each attempt is one more chance of a false alarm.
+    threshold = matching.threshold + np.log(len(attempts))
     thorough = matching._replace(threshold=threshold)
     quick = _quick(thorough)
     weights = np.where([attempt.thorough for attempt in attempts], THOROUGH, 1.0)
