@@ -29,7 +29,7 @@ from epipole.tasks.common.tracklet_arrays import (
 )
 
 # Tracklets that may join an object.
-FREE = (Outcome.UNDECIDED, Outcome.SEEN_BY_ONE, Outcome.NOT_COMPARED)
+FREE = (Outcome.AMBIGUOUS, Outcome.UNDECIDED, Outcome.SEEN_BY_ONE, Outcome.NOT_COMPARED)
 
 
 class OrbitLinks(NamedTuple):

@@ -83,7 +83,14 @@ def test_a_new_object_has_no_id_of_one_without_tracklets(scene):
     assert min(found.values()) == "20260530-00042"
 
 
-@pytest.mark.parametrize("outcome", ["ambiguous", "disagrees", "sensor_left_out"])
+@pytest.mark.parametrize("outcome", ["ambiguous", "undecided", "seen_by_one", "not_compared"])
+def test_tracklets_without_an_object_are_linked(scene, outcome):
+    links = linked(rows_of(scene, outcome=[outcome] * 24))
+    assert links.tracklets.equals(linked(rows_of(scene)).tracklets)
+    assert links.tracklets.num_rows
+
+
+@pytest.mark.parametrize("outcome", ["disagrees", "sensor_left_out"])
 def test_tracklets_of_other_outcomes_stay_as_they_are(scene, outcome):
     links = linked(rows_of(scene, outcome=[outcome] * 24))
     assert links.tracklets.num_rows == 0
