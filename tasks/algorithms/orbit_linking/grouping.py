@@ -203,7 +203,7 @@ def _best_first(
 def _far_edges(
     tracklets: Tracklets, alone: Array, sets: Sets, epoch_s: Array, state: Array, max_gap_s: float
 ) -> Edges:
-    """Return the edges from ends of sets to later sets, and to single tracklets."""
+    """Return the edges from ends of sets to later sets, and to single tracklets and pairs."""
     n = len(sets.root)
     roots = np.flatnonzero((sets.root == np.arange(n)) & np.isfinite(epoch_s))
     heads, tails = no_ends(len(roots)), no_ends(len(roots))
@@ -211,7 +211,8 @@ def _far_edges(
     heads, tails = sound_ends(heads), sound_ends(tails)
     pairs = near_orbits(tails, heads, max_gap_s)
     edges = [_between(tails, pairs[:, 0], heads.row[pairs[:, 1]], heads.time_s[pairs[:, 1]])]
-    free = np.flatnonzero((sets.root == np.arange(n)) & (sets.size == 1))
+    # After an hour the orbit of a pair is too uncertain to be compared with another orbit.
+    free = np.flatnonzero(sets.size[sets.root] <= 2)
     for ends, way in ((tails, 1), (heads, -1)):
         end, k = all_near_tracklets(ends, tracklets, free, way, NEAR_S, max_gap_s).T
         edges.append(_between(ends, end, k, tracklets.time_s[k]))
@@ -257,8 +258,7 @@ def _fit_ends(tracklets, alone, sets, roots, epoch_s, states, heads, tails):
             )
             if np.isfinite(evidence):
                 ends.row[s], ends.time_s[s], ends.epoch_s[s] = k, at_s, epoch
-                for m in range(6):
-                    ends.state[s, m] = state[m]
+                ends.state[s] = state
 
 
 @kernel
@@ -346,8 +346,7 @@ def _begin_known(tracklets, alone, sets, epoch_s, states):
                 )
                 if evidence > best:
                     best, epoch_s[root] = evidence, epoch
-                    for m in range(6):
-                        states[root, m] = state[m]
+                    states[root] = state
 
 
 @kernel
@@ -544,11 +543,13 @@ def _confirm(tracklets, alone, stays, log_odds, sets, is_loose, epoch_s, states)
                 if sets.size[root] > 2:
                     break
                 k = root if not stays[root] else sets.next[root]
+                if stays[k]:  # `_begin_known` finds its orbit again
+                    epoch_s[root] = np.nan
+                    break
             first = _release(sets, root, k)
             if first != root:
                 epoch_s[first] = epoch_s[root]
-                for m in range(6):
-                    states[first, m] = states[root, m]
+                states[first] = states[root]
                 epoch_s[root], root = np.nan, first
         if sets.size[root] == 1:
             epoch_s[root] = np.nan

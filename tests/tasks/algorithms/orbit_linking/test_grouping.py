@@ -180,3 +180,47 @@ def test_the_orbit_of_an_object_is_near_the_true_one():
         dt_s = scene.tracklets.time_s[rows[0]] - found.epoch_s[root]
         state = propagate(found.state[root], dt_s)
         assert np.linalg.norm(state[:3] - scene.state[rows[0], :3]) < 5.0
+
+
+def of_two_times(seed, n_objects, kept):
+    """Return tracklets of the objects, some of six each: three after a pause of 90 minutes; their
+    objects; and the known object of each, that of the first two."""
+    scene = orbit_tracklets(
+        seed, n_objects, 6, 100.0, direction_arcsec=8.0, rate_arcsec_s=6.0, pause_s=5400.0
+    )
+    of_object = np.argsort(scene.object, kind="stable").reshape(n_objects, 6)
+    rows = np.sort(of_object[:, kept].ravel())
+    known = np.where(np.isin(rows, of_object[:, :2]), scene.object[rows], NONE)
+    tracklets = Tracklets(*(np.ascontiguousarray(column[rows]) for column in scene.tracklets))
+    return tracklets, scene.object[rows], known
+
+
+@pytest.mark.parametrize("kept", [[0, 3, 4, 5], [0, 1, 3, 4, 5]])
+def test_an_object_of_one_or_two_tracklets_is_found_again_hours_later(kept):
+    found = 0
+    for seed in (60, 61):
+        tracklets, number, known = of_two_times(seed, 25, kept)
+        label = link_tracklets(
+            tracklets, known, max_gap_s=900.0, log_odds=7.0, max_orbit_gap_s=10_800.0
+        ).label
+        assert wrong(label, number) == 0
+        of_object = np.argsort(number, kind="stable").reshape(25, -1)
+        found += sum(label[rows[0]] == label[rows[-1]] for rows in of_object)
+    assert found > (25 if len(kept) == 4 else 40)
+
+
+@pytest.mark.parametrize("seed", [60, 61, 62])
+def test_known_objects_stay_whole_where_a_rough_tracklet_joins_and_leaves(seed):
+    """The third tracklet of each says little of its rates."""
+    tracklets, number, known = of_two_times(seed, 25, [0, 1, 2, 3, 4, 5])
+    rough = np.argsort(number, kind="stable").reshape(25, 6)[:, 2]
+    rad_s = 200 * np.pi / 648_000
+    error = np.random.default_rng(seed).normal(0, rad_s, (25, 2, 1))
+    tracklets.w[rough] += error[:, 0] * tracklets.east[rough] + error[:, 1] * tracklets.north[rough]
+    tracklets.cov[rough, [[2], [3]], [[2], [3]]] += rad_s**2
+    label = link_tracklets(
+        tracklets, known, max_gap_s=900.0, log_odds=7.0, max_orbit_gap_s=10_800.0
+    ).label
+    assert wrong(label, number) == 0
+    for k in range(25):
+        assert len(np.unique(label[known == k])) == 1
