@@ -37,7 +37,7 @@ def observations(parts: NightParts) -> Iterator[pa.Table]:
     for span in parts.spans:
         viewed_parts = [of.viewed for of in parts.sensors if of.viewed.holds(span)]
         tables = [partial(viewed.read, span, "sightings") for viewed in viewed_parts]
-        errors = _shared_errors(parts, span)
+        errors = shared_errors(parts, span)
         for rows in in_slices(tables, span, "time"):
             seen = with_objects(to_polars(concat(SIGHTINGS, rows)), runs)
             seen = seen.filter(pl.col("tracklet_id").is_in(hot.implode()).not_())
@@ -190,7 +190,8 @@ def _asof(
     )  # fmt: skip
 
 
-def _shared_errors(parts: NightParts, span: Span) -> pl.DataFrame:
+def shared_errors(parts: NightParts, span: Span) -> pl.DataFrame:
+    """Return SHARED_ERRORS of a span; empty where no sensor's are larger than stated."""
     errors = parts.solved.errors
     tables = [errors.read(span, "errors")] if errors.holds(span) else []
     return to_polars(concat(SHARED_ERRORS, tables))

@@ -33,7 +33,9 @@ from epipole.tasks.publish.observed_objects import (
     longest_object,
     object_runs,
     observations,
+    shared_errors,
     with_links,
+    with_shared_errors,
 )
 
 # These tables may not fit in memory as a whole: they are written in slices of time.
@@ -81,19 +83,27 @@ def _of_night(name: str, parts: NightParts) -> pa.Table:
 
 def tracklets_of_night(parts: NightParts) -> pa.Table:
     """Return TRACKLETS of the run: with their objects, and with their attributables."""
-    found = [
-        of.viewed.read(span, "attributables")
-        for of in parts.sensors
-        for span in parts.all_spans
-        if of.viewed.holds(span)
-    ]
     rows = to_polars(confirmed_tracklets(parts))
-    for more in (longest_object(object_runs(parts)), to_polars(concat(ATTRIBUTABLES, found))):
+    sensors = rows.select("tracklet_id", "sensor_id")
+    found = pl.concat(_attributables(parts, span, sensors) for span in parts.all_spans)
+    for more in (longest_object(object_runs(parts)), found):
         rows = rows.join(more, on="tracklet_id", how="left", maintain_order="left")
     linked = with_links(rows, parts)
     joined = rows["object_id"].is_null() & linked["object_id"].is_not_null()
     outcome = pl.when(joined).then(pl.lit(Outcome.LINKED.value)).otherwise("outcome")
     return from_polars(TRACKLETS, linked.with_columns(outcome=outcome))
+
+
+def _attributables(parts: NightParts, span: Span, sensors: pl.DataFrame) -> pl.DataFrame:
+    """Return ATTRIBUTABLES of a span, with the shared errors that `observations` have.
+
+    `sensors` has the sensor of each tracklet.
+    """
+    viewed = [of.viewed for of in parts.sensors if of.viewed.holds(span)]
+    rows = to_polars(concat(ATTRIBUTABLES, [each.read(span, "attributables") for each in viewed]))
+    rows = rows.join(sensors, on="tracklet_id", how="left", maintain_order="left")
+    errors = shared_errors(parts, span)
+    return with_shared_errors(rows, errors, parts.solved.more_km).drop("sensor_id")
 
 
 def _of_sensors(name: str, parts: NightParts) -> Iterator[pa.Table]:

@@ -310,10 +310,11 @@ def sample_objects(members: pa.Table, max_views: int) -> pa.Table:
     n_views = 0
     for sensor, objects in of_sensor.items():
         for object_ in objects:
-            enough = n_chosen[sensor] >= MIN_OBJECTS
-            if enough or (chosen and n_views + size[object_] > max_views):
+            if n_chosen[sensor] >= MIN_OBJECTS:
                 break
             if object_ not in chosen:
+                if chosen and n_views + size[object_] > max_views:
+                    break
                 chosen.add(object_)
                 n_views += size[object_]
                 for seeing in sees[object_]:

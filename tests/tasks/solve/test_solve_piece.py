@@ -304,6 +304,17 @@ def test_a_sensor_s_longest_objects_are_the_first():
     assert sorted(set(chosen["object"].to_pylist())) == list(range(20 - MIN_OBJECTS, 20))
 
 
+def test_an_object_that_is_chosen_already_does_not_end_the_choice():
+    """Three sensors see a long object, two of them also twenty short ones."""
+    rows = members(
+        *((0, s, f"{s}-0", f"{s}-0", 0, 60, n) for s, n in ((0, 10), (1, 500), (2, 400))),
+        *((k, s, f"{s}-{k}", f"{s}-{k}", 0, 60, 5) for k in range(1, 21) for s in (1, 2)),
+    )
+    chosen = to_polars(sample_objects(rows, 1000))
+    seen = collections.Counter(chosen.select("sensor", "object").unique()["sensor"].to_list())
+    assert seen == {0: 1, 1: MIN_OBJECTS, 2: MIN_OBJECTS}
+
+
 def test_one_object_is_judged_however_long_it_is():
     rows = members((0, 0, "a", "a", 0, 60, 500), (0, 1, "b", "b", 0, 60, 500))
     assert sample_objects(rows, 10).equals(rows)
