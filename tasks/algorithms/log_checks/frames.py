@@ -93,9 +93,8 @@ def check_frames(
     if not len(frames.time_ns):
         return []
     found = [check_times(frames), *check_coverage(frames.time_ns, state_ns, state_gap_s)]
-    found += check_numbers(frames, camera)
-    if not found or found[-1].verdict != WRONG:
-        found += check_exposures(frames)
+    two_sensors = check_numbers(frames, camera)
+    found += two_sensors or check_exposures(frames)
     if camera is None:
         facts = {"frames": float(len(frames.time_ns))}
         found.append(

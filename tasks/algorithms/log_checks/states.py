@@ -205,7 +205,13 @@ def _jumps(arcs: Sequence[Arc]) -> tuple[Finding, list[Arc], float]:
         largest = max(largest, float(off[~good].max(initial=0.0)))
         no_path = good.sum() < len(good) * (1 - MAX_OUTLIERS)
         kept.append(arc if no_path else Arc(arc.t_s[good], arc.r[good], arc.v[good], arc.sigma))
-    scatter_km = float(np.median(scatters))
+    # The polynomial of a short arc may be farther off than its states are.
+    of_long = [
+        scatter
+        for scatter, arc in zip(scatters, arcs, strict=True)
+        if len(arc.t_s) >= MIN_SCATTER_STATES
+    ]
+    scatter_km = float(np.median(of_long or scatters))
     found = Finding(SMOOTHNESS, SOUND, outliers, expected=0.0, facts={"states": total})
     if not total:
         found = found._replace(verdict=UNKNOWN, value=float("nan"), cause="too_few_states")

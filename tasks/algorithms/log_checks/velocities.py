@@ -23,6 +23,8 @@ MODEL_SHARE = 0.003  # of the orbital speed, allowed for what the path leaves ou
 ZERO_KM_S = 1e-9
 CLEARLY = 0.1  # what another meaning leaves of the difference
 LARGE_SHARE = 0.1  # of the speed: another velocity, and not a poor one
+# Of the orbital speed: more noise is not allowed for. Else velocities at random were sound.
+MAX_NOISE_SHARE = LARGE_SHARE / SIGMAS
 
 
 def check_velocities(arcs: Sequence[ReadArc]) -> Finding:
@@ -59,15 +61,25 @@ def _compared(arcs: Sequence[ReadArc]) -> tuple[Array, Array, Array, float]:
         path.append(found.v_km_s[known])
         stated.append(arc.v_km_s[known])
         r.append(arc.r_km[known])
-        noise = np.diff(stated[-1] - path[-1], axis=0)
-        sigma = found.v_sigma_km_s + (_median_length(noise) if len(noise) else 0.0)
-        allowed.append(SIGMAS * sigma + MODEL_SHARE * _orbital_speed(r[-1]))
+        speed = _orbital_speed(r[-1])
+        sigma = found.v_sigma_km_s + min(_noise(stated[-1] - path[-1]), MAX_NOISE_SHARE * speed)
+        allowed.append(SIGMAS * sigma + MODEL_SHARE * speed)
     if not path:
         none = np.zeros((0, 3))
         return none, none, none, np.nan
     return (
         np.concatenate(path), np.concatenate(stated), np.concatenate(r), float(np.median(allowed))
     )  # fmt: skip
+
+
+def _noise(off: Array) -> float:
+    """Return the scatter [km/s] of differences (n, 3) that follow each other; 0 of less than three.
+
+    Second differences: those of velocities that are wrong change steadily along the path. Scaled
+    as the length of a step between two that are independent.
+    """
+    bends = np.diff(off, n=2, axis=0)
+    return _median_length(bends) / np.sqrt(3.0) if len(bends) else 0.0
 
 
 def _meanings(path: Array, r_km: Array) -> list[tuple[str, Array]]:

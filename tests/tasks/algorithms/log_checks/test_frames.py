@@ -181,3 +181,10 @@ def test_stated_errors_are_held_against_the_scatter_of_stars(stated_px, cause):
     assert found.cause == cause
     assert found.value == pytest.approx(0.1, rel=0.1)
     assert check_star_scatter(dx[:9], dy[:9], np.full(9, stated_px), 1) is None
+
+
+def test_exposures_are_checked_where_the_times_of_states_are_wrong_too():
+    long = frames(0.2 * np.arange(100), exposure_s=np.full(50, 100.0))
+    found = check_frames(long, ns(18.0 + np.arange(20)), CAMERA, 30.0)
+    causes = {each.cause for each in found if each.verdict == WRONG}
+    assert causes == {"frames_and_states_shifted", "exposure_too_long"}

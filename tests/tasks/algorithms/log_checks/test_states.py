@@ -138,6 +138,42 @@ def test_exchanged_axes_show_where_they_turn_with_the_earth(duration_s):
     assert causes(changed) == set()
 
 
+@pytest.mark.parametrize("step_s", [1, 30, 240])
+@pytest.mark.parametrize("kind", ["low", "middle", "geostationary"])
+def test_velocities_at_random_are_not_those_of_the_path(kind, step_s):
+    rng = np.random.default_rng(12)
+    states = ephemeris(rng, kind, 60 * step_s, step_s, 0.01, 0.022)
+    for velocities in (
+        rng.normal(0, 4, states.v_km_s.shape),
+        states.v_km_s + rng.normal(0, 3, states.v_km_s.shape),
+    ):
+        assert causes(states._replace(v_km_s=velocities)) == {"velocities_disagree"}
+
+
+@pytest.mark.parametrize("step_s", [60, 120, 240])
+@pytest.mark.parametrize(
+    ("mistake", "cause"),
+    [
+        (zero, "velocities_zero"),
+        (negated, "velocities_negated"),
+        (velocities_in_m_s, "velocities_in_m_s"),
+    ],
+)
+def test_mistakes_of_velocities_are_named_where_states_are_far_apart(mistake, cause, step_s):
+    states = ephemeris(np.random.default_rng(13), "low", 7200, step_s, 0.01, 0.022)
+    assert causes(mistake(states)) == {cause}
+
+
+def test_arcs_of_few_states_do_not_show_the_scatter_of_others():
+    """A state in ten seconds, later one in a minute, in a low orbit with errors of metres."""
+    for seed in range(5):
+        states = ephemeris(np.random.default_rng(seed), "low", 15_000, 10, 0.0005, 0.0015)
+        kept = np.append(np.arange(400), np.arange(400, len(states.time_ns), 6))
+        fields = ("time_ns", "r_km", "v_km_s", "sigma_km")
+        states = states._replace(**{name: getattr(states, name)[kept] for name in fields})
+        assert causes(states) == set()
+
+
 def test_a_scatter_beyond_the_stated_sigma_is_named_with_its_size():
     found = [
         {each.check: each for each in check_states(states)}["position_sigma"]
