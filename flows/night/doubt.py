@@ -16,8 +16,10 @@ from epipole.flows.night.stages import Checked, check, solve
 from epipole.flows.night.summary import many
 from epipole.flows.night.work import Work
 from epipole.io.work.work_layout import SolvedParts
+from epipole.schemas.bridge import array
 from epipole.schemas.rejects import Reason
 from epipole.schemas.settings import Settings
+from epipole.tasks.algorithms.constants import SECOND_NS
 from epipole.tasks.algorithms.sensor_faults.fault_judgement import LEAST_AGREEING, SOUND, Doubt
 from epipole.tasks.check.check_sensors import SensorVerdict
 
@@ -55,16 +57,17 @@ def settle(work: Work, solved: SolvedParts, checked: Checked, settings: Settings
     work
         As it was before the check.
     """
-    if not in_doubt(checked.work, solved, checked):
+    window_s = settings.association.window_s
+    if not in_doubt(checked.work, solved, checked, window_s):
         if checked.left_out:
             solved = solve(work, settings, checked.left_out)
         return Settled(checked.work, solved, clocks=_clocks(checked.work))
     wide = solve(work, settings, more_km=WIDE_KM)
     judged = check(work, wide, settings, correct=False)
     clocks = _clocks(judged.work)
-    if judged.left_out and not in_doubt(judged.work, wide, judged):
+    if judged.left_out and not in_doubt(judged.work, wide, judged, window_s):
         solved = solve(work, settings, judged.left_out)
-        if not in_doubt(judged.work, solved, judged):
+        if not in_doubt(judged.work, solved, judged, window_s):
             return Settled(judged.work, solved, clocks=clocks)
     more_km = _error_km(checked.doubt, judged.doubt)
     LOGGER.warning(
@@ -88,30 +91,39 @@ def _clocks(work: Work) -> tuple[SensorVerdict, ...]:
     return tuple(one for one in work.verdicts if one.has_wrong_clock)
 
 
-def in_doubt(work: Work, solved: SolvedParts, checked: Checked) -> bool:
-    """Return whether it is not clear which sensors are wrong.
+def in_doubt(work: Work, solved: SolvedParts, checked: Checked, window_s: float) -> bool:
+    """Return whether it is not clear which sensors are wrong; `window_s` is that of association.
 
     A clock is wrong against the states of the same sensor: it needs no others that agree.
     """
     doubt = checked.doubt
     if doubt.undecided or np.isfinite(doubt.shared_s) or doubt.spread_log_odds > MIN_LOG_ODDS:
         return True
-    agree, disagree = _sides(work, solved)
+    agree, disagree = _sides(work, solved, window_s)
+    late = {one.sensor_id for one in _clocks(checked.work)}
     faulty = {name for name, why in checked.left_out.items() if why != Reason.CLOCK_OFF}
-    agree, disagree = agree - set(checked.left_out), disagree | faulty
+    agree, disagree = agree - set(checked.left_out) - late, (disagree - late) | faulty
     return bool(disagree) and len(agree) < max(len(disagree) + 1, LEAST_AGREEING)
 
 
-def _sides(work: Work, solved: SolvedParts) -> tuple[set[str], set[str]]:
-    """Return the sensors that have objects with others, and those mostly left out at that."""
+def _sides(work: Work, solved: SolvedParts, window_s: float) -> tuple[set[str], set[str]]:
+    """Return the sensors that have objects with others, and those mostly left out at that.
+
+    Both are counted by tracklets and windows of association, of `window_s` [s].
+    """
     names = {sensor.number: sensor.sensor_id for sensor in work.spans}
     joined, left_out = dict.fromkeys(names.values(), 0), dict.fromkeys(names.values(), 0)
     for span in work.all_spans():
         if not solved.holds(span):
             continue
-        members = solved.objects.read(span, "members", ["sensor"])["sensor"]
-        for pair in pc.value_counts(members).to_pylist():
-            joined[names[pair["values"]]] += pair["counts"]
+        members = solved.objects.read(span, "members", ["sensor", "first_epoch", "last_epoch"])
+        first, last = (
+            array(members, name) // round(window_s * SECOND_NS)
+            for name in ("first_epoch", "last_epoch")
+        )
+        count = np.bincount(array(members, "sensor"), last - first + 1)
+        for number in np.flatnonzero(count).tolist():
+            joined[names[number]] += int(count[number])
         for rows in solved.of_blocks(span, "rejects"):
             rows = rows.filter(pc.equal(rows["reason"], Reason.SENSOR_DISAGREES.value))
             for name, count in zip(

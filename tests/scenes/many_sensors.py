@@ -25,7 +25,7 @@ def circular(rng, n: int, radius_km: float, highest: float):
 
 def lines_of_many(
     seed: int, n_sensors: int, n_groups: int, late_s: Mapping[int, float] | None = None,
-    off_km: Mapping[int, float] | None = None,
+    off_km: Mapping[int, float] | None = None, seen_share: float = SEEN,
 ) -> Lines:  # fmt: skip
     """Return lines of sight from sensors, some with late clocks or an ephemeris off along x."""
     rng = np.random.default_rng(seed)
@@ -37,7 +37,7 @@ def lines_of_many(
     rows = []
     for g in range(n_groups):
         r, w = circular(rng, n_sensors, 7500.0, 2.0)
-        seen = np.flatnonzero(rng.random(n_sensors) < SEEN)
+        seen = np.flatnonzero(rng.random(n_sensors) < seen_share)
         d = delay[seen, None]
         u = (x[g] - v[g] * d) - (r[seen] - w[seen] * d)
         u /= np.linalg.norm(u, axis=1, keepdims=True)

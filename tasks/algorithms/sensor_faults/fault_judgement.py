@@ -134,6 +134,7 @@ def judge_sensors(
     position_sigma_km: Array,
     attitude_sigma_rad: Array,
     guess_s: Array | None = None,
+    n_others: int = 0,
 ) -> JudgedSensors:
     """Return each sensor's clock offset and fault.
 
@@ -147,6 +148,8 @@ def judge_sensors(
         never at fault).
     guess_s : (s,) float
         Initial clock offsets; needed if one is seconds. Default 0.
+    n_others : int
+        Number of further sensors, assumed sound: their lines have the sensor -1.
 
     Notes
     -----
@@ -167,7 +170,7 @@ def judge_sensors(
             model,
             np.flatnonzero(has_lines),
             attitude_sigma_rad > 0,
-            bool((lines.sensor >= 0).all()),
+            n_others,
         )
         wrong = np.array([(s, CLOCK) in explained.faults for s in range(n_sensors)], bool)
         wrong |= (ALL, SHARED) in explained.faults
@@ -287,19 +290,19 @@ class _Explanation(NamedTuple):
 
 
 def _explain(
-    model: Model, sensors: Indices, has_prior_attitude: Flags, are_all: bool
+    model: Model, sensors: Indices, has_prior_attitude: Flags, n_others: int
 ) -> _Explanation:
     """Return the faults that are in the best set and in all sets of nearly the same score.
 
     The score is the log evidence minus a penalty for each fault. An attitude can be wrong only
-    where `has_prior_attitude`. Clocks can share an offset only if these `are_all` sensors.
+    where `has_prior_attitude`. Clocks can share an offset only if there are no others.
     """
     score: dict[Faults, float] = {}
     kinds = [
         [(s, kind) for kind in COLUMNS if kind != ATTITUDE or has_prior_attitude[s]]
         for s in sensors.tolist()
     ]
-    if are_all:
+    if not n_others:
         kinds.append([(ALL, SHARED)])
 
     def judge(faults: Faults) -> float:
@@ -323,7 +326,7 @@ def _explain(
                 break
             best = better
     good = [faults for faults, value in score.items() if value > score[best] - DISTINCT_LOG_ODDS]
-    return _conclude(best, good, len(sensors))
+    return _conclude(best, good, len(sensors) + n_others)
 
 
 def _conclude(best: Faults, good: list[Faults], n_sensors: int) -> _Explanation:

@@ -74,6 +74,7 @@ def judge_many_sensors(
             position_sigma_km[together],
             attitude_sigma_rad[together],
             guess_s[together],
+            len(np.setdiff1d(left.sensor, together)),
         )
         newly = _store_judged(found, judged, together)
         if not newly:

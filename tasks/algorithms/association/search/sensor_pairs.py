@@ -220,7 +220,7 @@ def passing_pairs(views: Views, sparse: Flags, farthest_km: float) -> tuple[Indi
     return a, b
 
 
-def _together(
+def _merged_pairs(
     one: tuple[Indices, Indices], other: tuple[Indices, Indices], n_sensors: int
 ) -> tuple[Indices, Indices]:
     """Return the pairs of both, in order."""
@@ -368,7 +368,7 @@ class SensorPairs:
         sparse = sparse_sensors(views)
         dense = ~(sparse[a] & sparse[b])
         passing = passing_pairs(views, sparse, farthest_km)
-        a, b = _together((a[dense], b[dense]), passing, n_sensors)
+        a, b = _merged_pairs((a[dense], b[dense]), passing, n_sensors)
         a, b = _longest_first(fields, a, b)
         self._index, self._fields = index, fields
         self.ranked = _ranked_pairs(fields, crowded, sparse, a, b, farthest_km)

@@ -64,6 +64,22 @@ def test_two_of_many_of_which_one_is_wrong_disagree_both():
 
 
 @pytest.mark.long
+@pytest.mark.parametrize("n_pairs", [5, 8])
+def test_pairs_of_which_one_is_wrong_disagree_where_many_others_agree(n_pairs):
+    """Nearly all that are judged together are of such pairs."""
+    n_sound = MAX_TOGETHER
+    n = n_sound + 2 * n_pairs
+    off_km = {n_sound + 2 * k: 8.0 for k in range(n_pairs)}
+    lines = lines_of_many(3, n, 600, off_km=off_km, seen_share=0.7)
+    of_pair = np.where(lines.sensor < n_sound, -1, (lines.sensor - n_sound) // 2)
+    turn = np.where(lines.group % 2 == 0, -1, lines.group // 2 % n_pairs)
+    kept = of_pair == turn  # those that agree have the even groups
+    lines = lines._replace(**{name: getattr(lines, name)[kept] for name in lines._fields})
+    found = judged(lines, n)
+    assert faults(found) == dict.fromkeys(range(n_sound, n), DISAGREES)
+    assert not found.doubt.undecided
+
+
 def test_of_a_hundred_sensors_no_sound_one_is_at_fault_and_offsets_are_honest():
     scores = []
     for seed in range(8):
