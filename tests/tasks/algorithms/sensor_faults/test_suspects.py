@@ -63,7 +63,6 @@ def test_two_of_many_of_which_one_is_wrong_disagree_both():
     assert not found.doubt.undecided
 
 
-@pytest.mark.long
 @pytest.mark.parametrize("n_pairs", [5, 8])
 def test_pairs_of_which_one_is_wrong_disagree_where_many_others_agree(n_pairs):
     """Nearly all that are judged together are of such pairs."""
@@ -80,6 +79,7 @@ def test_pairs_of_which_one_is_wrong_disagree_where_many_others_agree(n_pairs):
     assert not found.doubt.undecided
 
 
+@pytest.mark.long
 def test_of_a_hundred_sensors_no_sound_one_is_at_fault_and_offsets_are_honest():
     scores = []
     for seed in range(8):
