@@ -26,6 +26,7 @@ from epipole.tasks.algorithms.association.odds import (
 from epipole.tasks.algorithms.association.search.candidates import best_of_sensor, lasts_throughout
 from epipole.tasks.algorithms.association.search.field_index import sensors_sharing
 from epipole.tasks.algorithms.association.search.instant_points import join, possible, solve
+from epipole.tasks.algorithms.association.search.search_space import doubled
 from epipole.tasks.algorithms.association.search.sight_lines import quantile
 from epipole.tasks.algorithms.association.views import error_sr, residual, residual_chi2
 from epipole.tasks.algorithms.kernels import borrowing_kernel, inlined_kernel, kernel
@@ -109,10 +110,10 @@ def grow_all(space, work, seeds, clear, min_score):
         if not value > min_score:
             continue
         if h == len(seed):
-            seed, value_of, clears = _doubled(seed, h), _doubled(value_of, h), _doubled(clears, h)
-            x_km = _doubled(x_km, h)
-            first_member = _doubled(first_member, h + 1)
-            first_missed = _doubled(first_missed, h + 1)
+            seed, value_of, clears = doubled(seed, h), doubled(value_of, h), doubled(clears, h)
+            x_km = doubled(x_km, h)
+            first_member = doubled(first_member, h + 1)
+            first_missed = doubled(first_missed, h + 1)
         at, at_missed = first_member[h], first_missed[h]
         member, missed = _with_capacity(member, at, n), _with_capacity(missed, at_missed, n_missed)
         member[at : at + n] = members[:n]
@@ -414,16 +415,8 @@ def _is_clear(space, work, members, n_missed, value, clear):
 
 
 @kernel
-def _doubled(values, n):
-    """Return an array twice as long as `values` (m, ...), with the same first n rows."""
-    out = np.empty((2 * len(values), *values.shape[1:]), values.dtype)
-    out[:n] = values[:n]
-    return out
-
-
-@kernel
 def _with_capacity(values, n, more):
     """Return `values` (m,), or a longer array with the same first n of them, for `more` values."""
     while n + more > len(values):
-        values = _doubled(values, n)
+        values = doubled(values, n)
     return values

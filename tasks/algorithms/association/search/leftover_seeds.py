@@ -9,6 +9,7 @@ objects in the corners of two of 8 or 16 fields were lost.
 import numpy as np
 
 from epipole.tasks.algorithms.association.odds import in_view
+from epipole.tasks.algorithms.association.search.search_space import doubled
 from epipole.tasks.algorithms.association.search.seeds import meet
 from epipole.tasks.algorithms.association.search.sight_lines import meeting_point
 from epipole.tasks.algorithms.kernels import borrowing_kernel, kernel
@@ -50,9 +51,7 @@ def leftover_seeds(space, pairs, enough, gate_sigma):
                 if _is_covered(views, pairs, m, x, enough, sees):
                     continue
                 if n == len(out):
-                    longer = np.empty((2 * n, 2), np.int64)
-                    longer[:n] = out
-                    out = longer
+                    out = doubled(out, n)
                 out[n, 0], out[n, 1] = i, j
                 n += 1
     return out[:n]

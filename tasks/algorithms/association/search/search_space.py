@@ -13,6 +13,7 @@ from epipole.tasks.algorithms.association.chance import Chance
 from epipole.tasks.algorithms.association.samples import InstantPoints
 from epipole.tasks.algorithms.association.search.field_index import FieldIndex
 from epipole.tasks.algorithms.association.views import Views
+from epipole.tasks.algorithms.kernels import kernel
 
 RESIDUAL_PARTS = 14  # of `views.residual`, and the right-hand side of `instant_points`
 PREDICTED_COLUMNS = 10  # of `candidates`
@@ -100,3 +101,11 @@ def work_space(views: Views) -> WorkSpace:
         before=np.empty(n + 2, np.int64),
         member_chi2=np.empty(n + 2),
     )
+
+
+@kernel
+def doubled(values, n):
+    """Return an array twice as long as `values` (m, ...), with the same first n rows."""
+    out = np.empty((2 * len(values), *values.shape[1:]), values.dtype)
+    out[:n] = values[:n]
+    return out

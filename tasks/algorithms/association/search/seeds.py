@@ -8,6 +8,7 @@ cost nothing.
 
 import numpy as np
 
+from epipole.tasks.algorithms.association.search.search_space import doubled
 from epipole.tasks.algorithms.association.search.sight_lines import pair_miss, quantile
 from epipole.tasks.algorithms.association.views import HAS_RATE, PLANE, SIGMA_KM, XX, YY, direction
 from epipole.tasks.algorithms.constants import ESCAPE_SPEED_KM_S, SPEED_OF_LIGHT_KM_S
@@ -48,9 +49,7 @@ def seeds_between(space, a, b, gate_sigma):
             while k < len(items_b) and angle_b[k] <= angle_a[q] + reach:
                 if meet(space, items_a[q], items_b[k], m, gate_sigma, axes):
                     if n == len(out):
-                        longer = np.empty((2 * n, 2), np.int64)
-                        longer[:n] = out
-                        out = longer
+                        out = doubled(out, n)
                     out[n, 0], out[n, 1] = items_a[q], items_b[k]
                     n += 1
                 k += 1

@@ -21,6 +21,7 @@ from epipole.tasks.algorithms.association.search.field_index import (
     cell_at,
     ground_range,
 )
+from epipole.tasks.algorithms.association.search.search_space import doubled
 from epipole.tasks.algorithms.association.search.seeds import SHORTEST_BASELINE_KM
 from epipole.tasks.algorithms.association.search.shared_points import (
     MIDDLE_SHARE,
@@ -29,6 +30,7 @@ from epipole.tasks.algorithms.association.search.shared_points import (
     field_middles,
     middle_points,
 )
+from epipole.tasks.algorithms.association.search.sight_lines import nearest_ranges
 from epipole.tasks.algorithms.association.views import (
     SIGMA_KM,
     XX,
@@ -255,9 +257,7 @@ def _passing(views, sparse, farthest_km):
                 ):
                     continue
                 if n == len(out):
-                    longer = np.empty((2 * n, 2), np.int64)
-                    longer[:n] = out
-                    out = longer
+                    out = doubled(out, n)
                 out[n, 0], out[n, 1] = a, b
                 n += 1
     return out[:n]
@@ -271,16 +271,9 @@ def _pass_near(camera_a, u_a, camera_b, u_b, rad, km, farthest_km):
     rows of `Views.camera`, of which the positions are read [km]; `u_a` and `u_b` (3,) are unit
     vectors, ICRS. `rad` [rad] and `km` [km] together limit the gap.
     """
-    cosine, along_a, along_b = 0.0, 0.0, 0.0
-    for k in range(3):
-        d = camera_b[k] - camera_a[k]
-        cosine += u_a[k] * u_b[k]
-        along_a += d * u_a[k]
-        along_b += d * u_b[k]
-    sine2 = 1.0 - cosine * cosine
-    if sine2 < 4.0 * rad * rad:
+    cosine, range_a, range_b = nearest_ranges(camera_a, u_a, camera_b, u_b)
+    if 1.0 - cosine * cosine < 4.0 * rad * rad:
         return cosine > 0.0
-    range_a, range_b = (along_a - cosine * along_b) / sine2, (cosine * along_a - along_b) / sine2
     if not (0.0 < range_a < farthest_km and 0.0 < range_b < farthest_km):  # false for NaN
         return False
     gap2, radius2 = 0.0, 0.0

@@ -81,24 +81,34 @@ def pair_miss(views, i, j, m, lowest, farthest, ui, uj):
 
 
 @borrowing_kernel
+def nearest_ranges(r_a, u_a, r_b, u_b):
+    """Return the cosine between two lines of sight, and the ranges [km] of their nearest points.
+
+    `r_a` and `r_b` are positions (3,) [km], GCRF, or begin with one, as rows of `Views.camera` do;
+    `u_a` and `u_b` (3,) are unit vectors, ICRS. The ranges of parallel lines are inf or NaN.
+    """
+    cosine, along_a, along_b = 0.0, 0.0, 0.0
+    for k in range(3):
+        d = r_b[k] - r_a[k]
+        cosine += u_a[k] * u_b[k]
+        along_a += d * u_a[k]
+        along_b += d * u_b[k]
+    sine2 = 1.0 - cosine * cosine
+    return cosine, (along_a - cosine * along_b) / sine2, (cosine * along_a - along_b) / sine2
+
+
+@borrowing_kernel
 def meeting_point(views, i, j, m, work, x):
     """Write to x (3,) [km], GCRF, the point of line i that is nearest to line j, at instant m.
 
     The lines of sight of two tracklets meet, see `pair_miss`; `work` (2, 3) is work space.
     """
-    ui, uj = work[0], work[1]
-    direction(views, i, m, ui)
-    direction(views, j, m, uj)
-    cosine, along_i, along_j = 0.0, 0.0, 0.0
+    r_i, u_i, u_j = views.camera[views.sensor[i], m], work[0], work[1]
+    direction(views, i, m, u_i)
+    direction(views, j, m, u_j)
+    _, reach, _ = nearest_ranges(r_i, u_i, views.camera[views.sensor[j], m], u_j)
     for a in range(3):
-        x[a] = views.camera[views.sensor[i], m, a]
-        baseline = views.camera[views.sensor[j], m, a] - x[a]
-        cosine += ui[a] * uj[a]
-        along_i += baseline * ui[a]
-        along_j += baseline * uj[a]
-    reach = (along_i - cosine * along_j) / (1.0 - cosine * cosine)
-    for a in range(3):
-        x[a] += reach * ui[a]
+        x[a] = r_i[a] + reach * u_i[a]
 
 
 @borrowing_kernel

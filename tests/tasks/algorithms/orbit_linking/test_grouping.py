@@ -18,6 +18,12 @@ def linked(scene, known=None, log_odds=7.0):
     return link_tracklets(scene.tracklets, known, max_gap_s=900.0, log_odds=log_odds).label
 
 
+def linked_over_hours(tracklets, known):
+    return link_tracklets(
+        tracklets, known, max_gap_s=900.0, log_odds=7.0, max_orbit_gap_s=10_800.0
+    ).label
+
+
 def wrong(label, number):
     """Return how many tracklets are in a group that mostly belongs to another object."""
     return sum(
@@ -140,9 +146,8 @@ def test_a_single_tracklet_joins_an_orbit_hours_away(first):
     kept = np.sort(order[:, [0, 2, 3] if first else [0, 1, 2]].ravel())
     seen = Tracklets(*(column[kept] for column in scene.tracklets))
     number, known = scene.object[kept], np.full(len(kept), NONE)
-    given = {"max_gap_s": 900.0, "log_odds": 7.0}
-    apart = link_tracklets(seen, known, **given).label
-    joined = link_tracklets(seen, known, **given, max_orbit_gap_s=10_800.0).label
+    apart = link_tracklets(seen, known, max_gap_s=900.0, log_odds=7.0).label
+    joined = linked_over_hours(seen, known)
     assert wrong(joined, number) == 0
     whole = [len(np.unique(joined[number == k])) == 1 for k in range(40)]
     assert sum(whole) >= 30
@@ -157,9 +162,8 @@ def test_a_single_tracklet_joins_a_known_object_hours_before():
     number = scene.object[kept]
     known = np.full(len(kept), NONE)
     known[np.isin(kept, order[:, :2])] = number[np.isin(kept, order[:, :2])]
-    given = {"max_gap_s": 900.0, "log_odds": 7.0, "max_orbit_gap_s": 10_800.0}
     for objects in (known, np.full(len(kept), NONE)):
-        label = link_tracklets(seen, objects, **given).label
+        label = linked_over_hours(seen, objects)
         assert wrong(label, number) == 0
         assert sum(len(np.unique(label[number == k])) == 1 for k in range(20)) >= 15
 
@@ -200,9 +204,7 @@ def test_an_object_of_one_or_two_tracklets_is_found_again_hours_later(kept):
     found = 0
     for seed in (60, 61):
         tracklets, number, known = of_two_times(seed, 25, kept)
-        label = link_tracklets(
-            tracklets, known, max_gap_s=900.0, log_odds=7.0, max_orbit_gap_s=10_800.0
-        ).label
+        label = linked_over_hours(tracklets, known)
         assert wrong(label, number) == 0
         of_object = np.argsort(number, kind="stable").reshape(25, -1)
         found += sum(label[rows[0]] == label[rows[-1]] for rows in of_object)
@@ -218,9 +220,7 @@ def test_known_objects_stay_whole_where_a_rough_tracklet_joins_and_leaves(seed):
     error = np.random.default_rng(seed).normal(0, rad_s, (25, 2, 1))
     tracklets.w[rough] += error[:, 0] * tracklets.east[rough] + error[:, 1] * tracklets.north[rough]
     tracklets.cov[rough, [[2], [3]], [[2], [3]]] += rad_s**2
-    label = link_tracklets(
-        tracklets, known, max_gap_s=900.0, log_odds=7.0, max_orbit_gap_s=10_800.0
-    ).label
+    label = linked_over_hours(tracklets, known)
     assert wrong(label, number) == 0
     for k in range(25):
         assert len(np.unique(label[known == k])) == 1
