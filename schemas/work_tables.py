@@ -453,7 +453,7 @@ LINKED_TRACKLETS = schema(
 
 LINKED_ORBITS = schema(
     "linked_orbits",
-    "One row per object that has no position: the orbit that joins its tracklets.",
+    "One row per object that has linked tracklets only: the orbit that joins them.",
     [
         id_column("object_id", doc="The object."),
         time_column("epoch", doc="Of the state, UTC."),

@@ -6,10 +6,11 @@ a task works on depends on the data and the settings, never on the workers.
 """
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
+import pyarrow as pa
 
 from epipole.flows.night.progress import results
 from epipole.flows.night.work import Work
@@ -17,8 +18,15 @@ from epipole.io.work.work_layout import SolvedParts, ViewedParts
 from epipole.schemas.bridge import array
 from epipole.schemas.rejects import Reason
 from epipole.schemas.settings import Settings
-from epipole.schemas.spans import Sensor, Span, spans_between
+from epipole.schemas.spans import DAY_NS, Sensor, Span, spans_between
 from epipole.schemas.stages import Stage
+from epipole.tasks.name.linked_objects import (
+    LinkedMembers,
+    add_linked_members,
+    names_with_linked,
+    tracklets_at_once,
+)
+from epipole.tasks.name.object_ids import Names
 from epipole.tasks.solve.align_epochs import EpochGrid, night_grid, usable_frames
 from epipole.tasks.solve.associate_block import associate_blocks, blocks_of
 from epipole.tasks.solve.number_objects import number_objects
@@ -162,31 +170,79 @@ def _solve(night: _Night, n_views: Mapping[Span, int]) -> int:
         spans, night.margin_ns, settings.association, settings.work.max_views, solved
     )
     (counts,) = results(Stage.SOLVE, [numbered], (2, STEPS))
-    viewed, margin_ns = night.viewed, night.margin_ns
-    max_views = MAX_JUDGED * night.epochs_apart
-    full = [span for span, count in zip(spans, counts, strict=True) if count]
-    judged = [
-        judge_span.submit(
-            viewed, span, margin_ns, night.apart_ns, max_views, settings.positions,
-            settings.states, solved,
-        )
-        for span in full
-    ]  # fmt: skip
-    results(Stage.SOLVE, judged, (3, STEPS))
     pieces = [
         Piece(span, number, count)
         for span, count in zip(spans, counts, strict=True)
         for number in range(count)
     ]
+    kept = {span: _kept_lines(night, n_views[span]) for span in spans}
+    return _solve_pieces(night, pieces, kept)
+
+
+def _solve_pieces(night: _Night, pieces: Sequence[Piece], kept: Mapping[Span, LineSampling]) -> int:
+    """Judge the sensors of the pieces' spans, and solve the pieces; return the positions."""
+    viewed, settings, margin_ns = night.viewed, night.settings, night.margin_ns
+    max_views = MAX_JUDGED * night.epochs_apart
+    judged = [
+        judge_span.submit(
+            viewed, span, margin_ns, night.apart_ns, max_views, settings.positions,
+            settings.states, night.solved,
+        )
+        for span in sorted({piece.span for piece in pieces})
+    ]  # fmt: skip
+    results(Stage.SOLVE, judged, (3, STEPS))
     futures = [
         solve_piece.submit(
-            viewed, piece, margin_ns, _kept_lines(night, n_views[piece.span]),
-            settings.positions, settings.states, solved,
+            viewed, piece, margin_ns, kept[piece.span], settings.positions, settings.states,
+            night.solved,
         )
         for piece in pieces
     ]  # fmt: skip
     n_positions: int = sum(results(Stage.SOLVE, futures, (4, STEPS)))
     return n_positions
+
+
+def solve_linked(
+    work: Work,
+    solved: SolvedParts,
+    tracklets: pa.Table,
+    linked: pa.Table,
+    names: Names,
+    settings: Settings,
+) -> tuple[SolvedParts, Names]:
+    """Solve once more the objects that linked tracklets show at the epochs of other sensors.
+
+    Parameters
+    ----------
+    tracklets
+        TRACKLETS of the run, with their objects.
+    linked
+        LINKED_TRACKLETS.
+    names
+        Ids of the night, after linking.
+
+    Returns
+    -------
+    solved
+        Where all objects are.
+    names
+        With the objects that have their first positions.
+    """
+    joined = tracklets_at_once(tracklets, linked)
+    if not len(joined):
+        return solved, names
+    spans = [span for span in work.all_spans() if solved.holds(span)]
+    grid = epoch_grid(work, settings)
+    night = _Night(list(work.spans), spans, grid, work, settings, solved.with_links())
+    future = add_linked_members.submit(
+        joined, {sensor.sensor_id: sensor.number for sensor in work.spans}, spans, names,
+        night.margin_ns, settings.work.max_views, night.viewed, solved,
+    )  # fmt: skip
+    members: LinkedMembers
+    (members,) = results(Stage.NAME, [future])
+    # The check of the sensors is over: it needs no lines of these objects.
+    _solve_pieces(night, members.pieces, dict.fromkeys(spans, LineSampling(DAY_NS)))
+    return night.solved, names_with_linked(names, night.solved, members)
 
 
 def _kept_lines(night: _Night, n_views: int) -> LineSampling:

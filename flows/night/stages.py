@@ -14,7 +14,7 @@ import numpy as np
 import pyarrow as pa
 
 from epipole.flows.night.progress import flat, results, step
-from epipole.flows.night.solving import solve_objects
+from epipole.flows.night.solving import solve_linked, solve_objects
 from epipole.flows.night.summary import Summary, many, summarise
 from epipole.flows.night.work import Spans, Work, count_frames, spans_of_night
 from epipole.io.catalogues.element_sets import KnownObjects
@@ -312,7 +312,7 @@ def write_night(
 ) -> pa.Table:
     """Join tracklets by orbits, and write the tables of a night to its folder.
 
-    Returns LINKED_ORBITS.
+    What an orbit joins has positions where several sensors saw it. Returns LINKED_ORBITS.
 
     Parameters
     ----------
@@ -324,7 +324,7 @@ def write_night(
     sensors = list(work.sensor_parts().values())
     of_night = spans_of_night(spans, night)
     parts = NightParts(night, of_night, spans, sensors, solved, names, whole, kept=settings.tables)
-    parts, orbits = _link(parts, settings)
+    parts, orbits = _link(work, parts, settings)
     futures = [write_tables.submit(tables, folder, parts) for tables in SHARES]
     results(Stage.PUBLISH, futures)
     return orbits
@@ -350,23 +350,28 @@ def list_objects(folder: Path, night: str, verdicts: Mapping[str, ObjectVerdict]
     results(Stage.PUBLISH, [write_objects.submit(folder, night, verdicts)])
 
 
-def _link(parts: NightParts, settings: Settings) -> tuple[NightParts, pa.Table]:
+def _link(work: Work, parts: NightParts, settings: Settings) -> tuple[NightParts, pa.Table]:
     """Return the parts with the tracklets that an orbit joins, and LINKED_ORBITS.
 
-    See `link_tracklets`.
+    See `link_tracklets` and `solve_linked`.
     """
     taken = sorted({name for of_span in parts.names.values() for name in of_span.values()})
     tracklets = tracklets_of_night(parts)
     future = link_tracklets.submit(tracklets, parts.night, taken, settings.linking)
     links: OrbitLinks
     (links,) = results(Stage.NAME, [future])
-    if links.tracklets.num_rows:
-        LOGGER.info("linked %s by orbits", many(links.tracklets.num_rows, "tracklet"))
     names = {
         folder: {old: links.renamed.get(new, new) for old, new in of_span.items()}
         for folder, of_span in parts.names.items()
     }
-    return parts._replace(names=names, linked=links.tracklets), links.orbits
+    parts = parts._replace(names=names, linked=links.tracklets)
+    if not links.tracklets.num_rows:
+        return parts, links.orbits
+    LOGGER.info("linked %s by orbits", many(links.tracklets.num_rows, "tracklet"))
+    solved, names = solve_linked(
+        work, parts.solved, tracklets_of_night(parts), links.tracklets, names, settings
+    )
+    return parts._replace(solved=solved, names=names), links.orbits
 
 
 def choose_elements(

@@ -18,6 +18,8 @@ Parts of reading belong to a run; all others to the nights and a key (see `folde
         objects/1554091200        the objects of the span, each with its views and its piece
         errors/1554091200         sensors whose shared errors are larger than stated
         pieces/1554091200/0       positions and states of some of the objects
+        linked_objects/...        spans in which orbits join more tracklets to objects, and the
+        linked_pieces/...         pieces of these objects
 """
 
 from collections.abc import Sequence
@@ -106,11 +108,18 @@ class SolvedParts(NamedTuple):
     """Where `solve` puts what it finds of the objects of all sensors.
 
     The positions of all sensors get the error `more_km`, 1-sigma per axis, beside the stated one.
+    With `linked`, parts are of objects with the tracklets that an orbit joins to them; pieces in
+    which it joins none are those of before.
     """
 
     root: Path
     more_km: float = 0.0
     kept: Path | None = None  # the folder of the parts of other runs, by key
+    linked: bool = False
+
+    def with_links(self) -> "SolvedParts":
+        """Return where the objects go that an orbit joins more tracklets to."""
+        return self._replace(linked=True)
 
     @property
     def blocks(self) -> Parts:
@@ -120,7 +129,7 @@ class SolvedParts(NamedTuple):
     @property
     def objects(self) -> Parts:
         """The objects of each span, numbered through the night: `NUMBERED`."""
-        return Parts(self.root / "objects")
+        return Parts(self.root / ("linked_objects" if self.linked else "objects"))
 
     @property
     def errors(self) -> Parts:
@@ -129,17 +138,19 @@ class SolvedParts(NamedTuple):
 
     def piece(self, span: Span, piece: int) -> Path:
         """Return the part of some objects of a span: `SOLVED`."""
-        return self.root / "pieces" / span.folder / str(piece)
+        folder = "linked_pieces" if self.linked else "pieces"
+        return self.root / folder / span.folder / str(piece)
 
     def holds(self, span: Span) -> bool:
         """Return whether the objects of the span are known, be it none."""
-        return self.objects.holds(span)
+        return self._replace(linked=False).objects.holds(span)
 
     def pieces(self, span: Span) -> list[Path]:
         """Return the parts of a span's pieces, in order."""
-        folder = self.root / "pieces" / span.folder
-        numbers = sorted(int(part.name) for part in folder.glob("[0-9]*"))
-        return [folder / str(number) for number in numbers]
+        folders = [self.root / "pieces", self.root / "linked_pieces"][: 1 + self.linked]
+        parts = [part for each in folders for part in (each / span.folder).glob("[0-9]*")]
+        newest = {int(part.name): part for part in parts}
+        return [newest[number] for number in sorted(newest)]
 
     def of_blocks(self, span: Span, name: str) -> list[pa.Table]:
         """Return a table of each block of a span."""

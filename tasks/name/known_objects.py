@@ -54,6 +54,9 @@ from epipole.tasks.name.elements_of_night import (
 from epipole.tasks.name.known_tracklets import name_tracklets, tracklet_rows
 from epipole.tasks.name.sensor_residuals import SensorResidual, sensor_residuals
 
+UNSEEN_NS = 600_000_000_000  # a longer time without a position ends a run of them
+Times = tuple[int, int]  # first and last, ns since 1970
+
 _COVARIANCE = ["cov_xx", "cov_xy", "cov_xz", "cov_yy", "cov_yz", "cov_zz"]
 
 
@@ -81,14 +84,14 @@ def name_known_objects(
     list
         How far each sensor's detections of known objects are from their predictions.
     """
-    observed, spans = observed_objects(folder)
+    observed, times = observed_objects(folder)
     verdicts: dict[str, NameVerdict] = {}
     others = IDENTIFICATIONS.empty_table()
     if known is not None:
         verdicts, learnt = judge_objects(observed, known, settings.probability)
         named = name_tracklets(folder, list(observed), learnt, settings.probability)
         others = tracklet_rows(named, known)
-    verdicts = _without_rivals(verdicts, spans)
+    verdicts = _without_rivals(verdicts, times)
     objects = sorted(observed.keys() | _seen_objects(folder) - set(others["object_id"].to_pylist()))
     rows = concat(IDENTIFICATIONS, [_rows(objects, verdicts, known), others])
     same_as = recognise_objects(folder, _unknown(rows), earlier, settings.earlier_h, link_log_odds)
@@ -116,8 +119,8 @@ def _seen_objects(folder: Path) -> set[str]:
     return set(pc.unique(rows["object_id"]).drop_null().to_pylist())
 
 
-def observed_objects(folder: Path) -> tuple[dict[str, Observed], dict[str, tuple[int, int]]]:
-    """Return some positions of each object, by id in order, and their first and last time."""
+def observed_objects(folder: Path) -> tuple[dict[str, Observed], dict[str, list[Times]]]:
+    """Return some positions of each object, by id in order, and the times when it was seen."""
     index = pl.DataFrame(read_columns(folder, "positions", ["object_id", "time", "independent"]))
     chosen = []
     for rows in index.with_row_index("row").partition_by("object_id", maintain_order=True):
@@ -134,10 +137,20 @@ def observed_objects(folder: Path) -> tuple[dict[str, Observed], dict[str, tuple
         of_name = np.flatnonzero(names == name)
         of_name = of_name[np.argsort(time_ns[of_name], kind="stable")]
         found[name] = Observed(time_ns[of_name], r_km[of_name], cov[of_name])
-    spans = index.group_by("object_id").agg(
-        first=pl.col("time").min().cast(pl.Int64), last=pl.col("time").max().cast(pl.Int64)
+    return found, _seen_times(index)
+
+
+def _seen_times(positions: pl.DataFrame) -> dict[str, list[Times]]:
+    """Return the first and last time of each unbroken run of an object's positions."""
+    rows = positions.select("object_id", pl.col("time").cast(pl.Int64)).sort("object_id", "time")
+    begins = (pl.col("time").diff().over("object_id") > UNSEEN_NS).fill_null(True)
+    runs = rows.group_by("object_id", begins.cum_sum().alias("run"), maintain_order=True).agg(
+        first=pl.col("time").first(), last=pl.col("time").last()
     )
-    return found, {name: (first, last) for name, first, last in spans.iter_rows()}
+    times: dict[str, list[Times]] = {}
+    for name, first, last in runs.select("object_id", "first", "last").iter_rows():
+        times.setdefault(name, []).append((first, last))
+    return times
 
 
 def catalogue_of(known: ElementsOfNight) -> KnownSatellites:
@@ -164,7 +177,7 @@ def judge_objects(
 
 
 def _without_rivals(
-    verdicts: Mapping[str, NameVerdict], spans: Mapping[str, tuple[int, int]]
+    verdicts: Mapping[str, NameVerdict], times: Mapping[str, Sequence[Times]]
 ) -> dict[str, NameVerdict]:
     """Return the verdicts; objects that were seen at one time are not one satellite.
 
@@ -180,7 +193,7 @@ def _without_rivals(
         for names in named.values()
         for name in names
         for other in names
-        if other != name and _overlap(spans[name], spans[other])
+        if other != name and _overlap(times[name], times[other])
     }
     return {
         name: verdict._replace(status="ambiguous") if name in rivals else verdict
@@ -188,8 +201,8 @@ def _without_rivals(
     }
 
 
-def _overlap(one: tuple[int, int], other: tuple[int, int]) -> bool:
-    return one[0] <= other[1] and other[0] <= one[1]
+def _overlap(one: Sequence[Times], other: Sequence[Times]) -> bool:
+    return any(a[0] <= b[1] and b[0] <= a[1] for a in one for b in other)
 
 
 def _status(verdicts: Mapping[str, NameVerdict], name: str) -> str:

@@ -132,18 +132,25 @@ def _orbits(rows: pl.DataFrame, found: LinkedTracklets, linked: pa.Table) -> pa.
 def _one_object(joined: pl.DataFrame) -> dict[str, str]:
     """Return the new ids of objects that are the same as an earlier one.
 
-    Objects that were seen at the same time keep their ids: an object has one position per epoch.
+    Objects of which two tracklets were seen at the same time keep their ids: an object has one
+    position per epoch.
     """
-    objects = (
-        joined.drop_nulls("object_id")
-        .group_by("label", "object_id")
-        .agg(first=pl.col("start_time").min(), last=pl.col("end_time").max())
-        .sort("label", "first", "object_id")
-    )
+    known = joined.drop_nulls("object_id").sort("start_time", "tracklet_id")
+    known = known.filter(pl.col("object_id").n_unique().over("label") > 1)
     renamed: dict[str, str] = {}
-    for _, of_label in objects.group_by("label", maintain_order=True):
-        name, until = of_label["object_id"][0], of_label["last"][0]
-        for object_id, first, last in of_label.select("object_id", "first", "last").rows()[1:]:
-            if first > until:
-                renamed[object_id], until = name, last
+    for _, of_label in known.group_by("label", maintain_order=True):
+        objects = of_label.partition_by("object_id", maintain_order=True)
+        first = objects[0]
+        for other in objects[1:]:
+            if not _at_once(first, other):
+                renamed[other["object_id"][0]] = first["object_id"][0]
+                first = pl.concat([first, other])
     return renamed
+
+
+def _at_once(one: pl.DataFrame, other: pl.DataFrame) -> bool:
+    """Return whether two objects have tracklets at the same time."""
+    start, end = (one[name].to_numpy()[:, None] for name in ("start_time", "end_time"))
+    return bool(
+        ((other["start_time"].to_numpy() <= end) & (start <= other["end_time"].to_numpy())).any()
+    )

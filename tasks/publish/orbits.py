@@ -80,8 +80,8 @@ def fit_orbits(
     """Fit the orbits of a share of the objects of a night, after `share_out`.
 
     The orbit of an object depends on the rows of this object only. `linked` are LINKED_ORBITS:
-    the initial states of objects without positions. What an orbit adds to its observations goes to
-    a part; see `write_fitted`.
+    the initial states of objects that an orbit joined. What an orbit adds to its observations goes
+    to a part; see `write_fitted`.
     """
     reader = NightReader.of_folder(folder, night)
     observed = of_share(folder, "observations", share)
@@ -92,7 +92,7 @@ def fit_orbits(
     starts = initial_states(reader, objects.names, positions)
     if linked is not None:
         rows = to_polars(linked)
-        starts = _starts(rows, rows.select(*POSITION, *VELOCITY).to_numpy()) | starts
+        starts |= _starts(rows, rows.select(*POSITION, *VELOCITY).to_numpy())
     fitted = [
         best_orbit(objects.directions(k), starts.get(name), origin_ns, around)
         for k, name in enumerate(objects.names)

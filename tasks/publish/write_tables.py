@@ -44,6 +44,7 @@ BY_SPAN = ("epochs", "associations", "positions", "pairs", "states")
 WHOLE = ("tracklets", "calibrations", "checks", "sources", "rejects")
 # The tables of one task each; stars are most of the work.
 SHARES = (("stars",), ("detections",), ("observations",), ("frames",), (*BY_SPAN, *WHOLE))
+DECIDED_BY_ORBITS = (Reason.AMBIGUOUS, Reason.UNDECIDED)
 SERVED_NS = 60_000_000_000  # longest time between an epoch and the frame that is used for it
 
 
@@ -203,12 +204,19 @@ def _renamed(rows: pa.Table, names: Mapping[str, str]) -> pa.Table:
 
 
 def _rejects(parts: NightParts) -> Iterator[pa.Table]:
+    linked = parts.linked["tracklet_id"]
     for span in parts.spans:
         for of_stage in (sensor.identified for sensor in parts.sensors):
             if of_stage.holds(span):
                 yield of_stage.read(span, "rejects")
-        yield from parts.solved.of_blocks(span, "rejects")
+        yield from (_left_out(of, linked) for of in parts.solved.of_blocks(span, "rejects"))
         yield from parts.solved.read(span, "rejects")
+
+
+def _left_out(rejects: pa.Table, linked: pa.ChunkedArray) -> pa.Table:
+    """Return the rejects of a block without those of tracklets that an orbit decided later."""
+    decided = pc.is_in(rejects["reason"], pa.array(DECIDED_BY_ORBITS))
+    return rejects.filter(pc.invert(pc.and_(decided, pc.is_in(rejects["tracklet_id"], linked))))
 
 
 def counted(rejects: Iterable[pa.Table]) -> pa.Table:

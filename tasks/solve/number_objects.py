@@ -52,8 +52,8 @@ def number_objects(
         numbered = _number(spans, settings, solved.blocks)
         for k, span in enumerate(spans):
             near = [numbered[j] for j in (k - 1, k, k + 1) if 0 <= j < len(spans)]
-            rows = _within(pl.concat(near), span.widened(margin_ns))
-            members = from_polars(OBJECT_MEMBERS, _in_pieces(rows, span, max_views))
+            rows = within(pl.concat(near), span.widened(margin_ns))
+            members = from_polars(OBJECT_MEMBERS, in_pieces(rows, span, max_views))
             write_part(solved.objects.of(span), NUMBERED, {"members": members})
     return [_count_pieces(solved.objects.read(span, "members", ["piece"])) for span in spans]
 
@@ -96,15 +96,15 @@ def _tracks(members: pl.DataFrame, known: dict[str, int]) -> dict[int, Indices]:
     return {object_: np.array(of_object, np.int64) for object_, of_object in tracks.items()}
 
 
-def _within(members: pl.DataFrame, time: Span) -> pl.DataFrame:
+def within(members: pl.DataFrame, time: Span) -> pl.DataFrame:
     """Return the members with views within a time."""
     first, last = (pl.col(name).cast(pl.Int64) for name in ("first_epoch", "last_epoch"))
     return members.filter((last >= time.start_ns) & (first < time.end_ns))
 
 
-def _in_pieces(members: pl.DataFrame, span: Span, max_views: int) -> pl.DataFrame:
+def in_pieces(members: pl.DataFrame, span: Span, max_views: int) -> pl.DataFrame:
     """Return the members of the objects in a span, each object in a piece."""
-    inside = _within(members, span)
+    inside = within(members, span)
     size = inside.group_by("object").agg(pl.col("n_views").sum()).sort("object")
     piece, in_piece = [], 0
     number = 0

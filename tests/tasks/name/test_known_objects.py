@@ -158,6 +158,10 @@ def test_one_satellite_that_is_seen_twice_has_its_name_twice(named, fleet):
     seen = {"a": (fleet[0], seconds(10)), "b": (fleet[0], seconds(40_000))}
     rows, _ = named(seen, ElementsOfNight("digest", fleet))
     assert rows["norad_id"].to_list() == [100_000, 100_000]
+    # Also between two times of the first one.
+    seen["a"] = (fleet[0], np.concatenate([seconds(10), seconds(60_000)]))
+    rows, _ = named(seen, ElementsOfNight("digest", fleet))
+    assert rows["norad_id"].to_list() == [100_000, 100_000]
 
 
 def test_an_unknown_object_is_recognised_as_one_of_an_earlier_night(named, fleet):

@@ -72,10 +72,16 @@ def test_an_object_that_is_seen_again_has_its_earlier_id(scene):
     outcome = ["object" if name else "seen_by_one" for name in named]
     links = linked(rows_of(scene, object_id=named, outcome=outcome))
     assert links.renamed == {"20260530-00002": "20260530-00001"}
-    # At the same time they stay two: an object has one position per epoch.
+    # Also in between.
     named[b], named[c] = named[c], named[b]
-    links = linked(rows_of(scene, object_id=named, outcome=outcome))
-    assert not links.renamed
+    rows = rows_of(scene, object_id=named, outcome=outcome)
+    assert linked(rows).renamed == links.renamed
+    # At the same time they stay two: an object has one position per epoch.
+    end = array(rows, "end_time").copy()
+    end[a] = array(rows, "start_time")[b]
+    together = rows_of(scene, object_id=named, outcome=outcome, end_time=end)
+    assert linked(together).tracklets.num_rows
+    assert not linked(together).renamed
 
 
 def test_a_new_object_has_no_id_of_one_without_tracklets(scene):
