@@ -25,6 +25,7 @@ from epipole.tasks.name.linked_objects import (
     add_linked_members,
     names_with_linked,
     tracklets_at_once,
+    without_refused,
 )
 from epipole.tasks.name.object_ids import Names
 from epipole.tasks.solve.align_epochs import EpochGrid, night_grid, usable_frames
@@ -209,7 +210,7 @@ def solve_linked(
     linked: pa.Table,
     names: Names,
     settings: Settings,
-) -> tuple[SolvedParts, Names]:
+) -> tuple[SolvedParts, Names, pa.Table]:
     """Solve once more the objects that linked tracklets show at the epochs of other sensors.
 
     Parameters
@@ -227,22 +228,26 @@ def solve_linked(
         Where all objects are.
     names
         With the objects that have their first positions.
+    linked
+        Without tracklets that the lines of sight of others contradict.
     """
     joined = tracklets_at_once(tracklets, linked)
     if not len(joined):
-        return solved, names
+        return solved, names, linked
     spans = [span for span in work.all_spans() if solved.holds(span)]
     grid = epoch_grid(work, settings)
     night = _Night(list(work.spans), spans, grid, work, settings, solved.with_links())
     future = add_linked_members.submit(
         joined, {sensor.sensor_id: sensor.number for sensor in work.spans}, spans, names,
-        night.margin_ns, settings.work.max_views, night.viewed, solved,
+        night.margin_ns, settings.work.max_views, settings.positions.reject_sigma, night.viewed,
+        solved,
     )  # fmt: skip
     members: LinkedMembers
     (members,) = results(Stage.NAME, [future])
     # The check of the sensors is over: it needs no lines of these objects.
     _solve_pieces(night, members.pieces, dict.fromkeys(spans, LineSampling(DAY_NS)))
-    return night.solved, names_with_linked(names, night.solved, members)
+    linked = without_refused(linked, members.refused, names)
+    return night.solved, names_with_linked(names, night.solved, members), linked
 
 
 def _kept_lines(night: _Night, n_views: int) -> LineSampling:

@@ -368,10 +368,10 @@ def _link(work: Work, parts: NightParts, settings: Settings) -> tuple[NightParts
     if not links.tracklets.num_rows:
         return parts, links.orbits
     LOGGER.info("linked %s by orbits", many(links.tracklets.num_rows, "tracklet"))
-    solved, names = solve_linked(
+    solved, names, linked = solve_linked(
         work, parts.solved, tracklets_of_night(parts), links.tracklets, names, settings
     )
-    return parts._replace(solved=solved, names=names), links.orbits
+    return parts._replace(solved=solved, names=names, linked=linked), links.orbits
 
 
 def choose_elements(

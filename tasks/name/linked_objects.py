@@ -10,26 +10,39 @@ from typing import NamedTuple
 import numpy as np
 import polars as pl
 import pyarrow as pa
+from scipy.special import chdtrc
 
 from epipole.io.work.parts import NUMBERED, write_part
 from epipole.io.work.work_layout import SolvedParts, ViewedParts
-from epipole.schemas.bridge import array, from_polars, to_polars
+from epipole.schemas.arrays import Flags, Indices
+from epipole.schemas.bridge import array, concat, from_polars, to_polars
 from epipole.schemas.spans import Span, spans_between
 from epipole.schemas.stages import Stage
-from epipole.schemas.work_tables import OBJECT_MEMBERS
+from epipole.schemas.work_tables import LINKED_TRACKLETS, OBJECT_MEMBERS, SHARED_ERRORS
 from epipole.tasks.common.stage_tasks import stage_task
 from epipole.tasks.name.object_ids import Names, number_of
 from epipole.tasks.solve.number_objects import in_pieces, within
+from epipole.tasks.solve.positions import solve_positions
 from epipole.tasks.solve.solve_piece import Piece, gather_views
+from epipole.tasks.solve.states import MIN_PROBABILITY
+from epipole.tasks.solve.view_groups import ViewGroups, unpack_views, with_larger_errors
 
+# Least share of a linked tracklet's views that agree with those of other sensors at their epochs.
+# Nearly all of a true one do; of a wrong pair in a scene of six sensors 6 of 31.
+MIN_AGREEING = 0.5
+_AGREEING = {"tracklet_id": pl.String, "agrees": pl.Boolean}
 SERVED_NS = 60_000_000_000  # longest time between an epoch and the frame that is used for it
 
 
 class LinkedMembers(NamedTuple):
-    """Members of linked objects: the `pieces` to solve, and the ids of objects by `number_of`."""
+    """Members of linked objects: the `pieces` to solve, and the ids of objects by `number_of`.
+
+    `refused` are linked tracklets whose lines of sight do not meet those of their objects.
+    """
 
     pieces: list[Piece]
     ids: dict[int, str]
+    refused: list[str]
 
 
 def tracklets_at_once(tracklets: pa.Table, linked: pa.Table) -> pl.DataFrame:
@@ -69,10 +82,14 @@ def add_linked_members(
     names: Names,
     margin_ns: int,
     max_views: int,
+    reject_sigma: float,
     viewed: ViewedParts,
     solved: SolvedParts,
 ) -> LinkedMembers:
     """Write the members of the spans in which linked tracklets share epochs with other sensors.
+
+    Those whose lines of sight miss the others' at most of these epochs are none of their object's:
+    an attributable has no curvature, and two short ones may fit one orbit by accident.
 
     Parameters
     ----------
@@ -86,6 +103,8 @@ def add_linked_members(
         Ids of the night, after linking.
     margin_ns, max_views
         As of `number_objects`.
+    reject_sigma
+        As of `solve_positions`.
     solved
         `objects` is read; those of `with_links` get a part for each span with such a tracklet.
     """
@@ -99,19 +118,27 @@ def add_linked_members(
         sensor=pl.col("sensor_id").replace_strict(sensors, return_dtype=pl.Int64),
     )
     one = {number - 1: member[name] for number, name in ids.items()}
-    pieces = []
+    found = {}
     for span in spans:
         linked = _linked_members(joined, span.widened(margin_ns), viewed)
-        if not len(linked):
-            continue
-        members = _renumbered(solved.objects.read(span, "members"), one, linked)
-        shared = _seen_together(members, linked, span.widened(margin_ns), viewed)
-        if len(shared):
-            rows, changed = _with_linked(members, linked, shared, span, max_views)
+        if len(linked):
+            found[span] = _renumbered(solved.objects.read(span, "members"), one, linked), linked
+    agreeing = [
+        _agreeing_views(*of_span, span, margin_ns, reject_sigma, viewed, solved)
+        for span, of_span in found.items()
+    ]
+    refused = _refused(agreeing)
+    pieces = []
+    for span, (members, linked) in found.items():
+        kept = linked.filter(pl.col("tracklet_id").is_in(refused).not_())
+        views, number = _shared_views(members, kept, span.widened(margin_ns), viewed)
+        shared = np.unique(number[_of(kept, views)]).tolist()
+        if shared:
+            rows, changed = _with_linked(members, kept, shared, span, max_views)
             tables = {"members": from_polars(OBJECT_MEMBERS, rows)}
             write_part(solved.with_links().objects.of(span), NUMBERED, tables)
             pieces += changed
-    return LinkedMembers(pieces, ids)
+    return LinkedMembers(pieces, ids, refused)
 
 
 def _next_number(solved: SolvedParts, spans: Sequence[Span]) -> int:
@@ -158,15 +185,64 @@ def _renumbered(members: pa.Table, one: Mapping[int, int], linked: pl.DataFrame)
     )
 
 
-def _seen_together(
+def _shared_views(
     members: pl.DataFrame, linked: pl.DataFrame, time: Span, viewed: ViewedParts
-) -> list[int]:
-    """Return the objects of which a linked tracklet has an epoch with another sensor."""
+) -> tuple[pa.Table, Indices]:
+    """Return the views of objects with linked tracklets; see `gather_views`."""
     of_linked = members.filter(pl.col("object").is_in(linked["object"].unique().implode()))
     rows = from_polars(OBJECT_MEMBERS, pl.concat([of_linked, linked]))
-    views, number = gather_views(viewed, rows, time)
-    counts = np.isin(views["tracklet_id"].to_pylist(), linked["tracklet_id"].to_list())
-    return np.unique(number[counts]).tolist()
+    return gather_views(viewed, rows, time)
+
+
+def _of(linked: pl.DataFrame, views: pa.Table) -> Flags:
+    """Return which views are of linked tracklets."""
+    return np.isin(views["tracklet_id"].to_pylist(), linked["tracklet_id"].to_list())
+
+
+def _agreeing_views(
+    members: pl.DataFrame, linked: pl.DataFrame, span: Span, margin_ns: int, reject_sigma: float,
+    viewed: ViewedParts, solved: SolvedParts,
+) -> pl.DataFrame:  # fmt: skip
+    """Return the views of linked tracklets, and which of them agree with the others' in a position.
+
+    Two views make a position however far they miss each other: its chi-square tells.
+    """
+    views, number = _shared_views(members, linked, span.widened(margin_ns), viewed)
+    errors = [solved.errors.read(span, "errors")] if solved.errors.holds(span) else []
+    groups = solve_positions(
+        with_larger_errors(unpack_views(views, number), concat(SHARED_ERRORS, errors)), reject_sigma
+    )
+    fits = groups.solved & (chdtrc(_dof(groups), groups.chi2) > MIN_PROBABILITY)
+    labels, agrees = groups.views.labels, groups.used & fits[groups.group]
+    rows = np.flatnonzero(_of(linked, labels))
+    return pl.DataFrame(
+        {"tracklet_id": labels["tracklet_id"].take(rows).to_pylist(), "agrees": agrees[rows]},
+        schema=_AGREEING,
+    )
+
+
+def _dof(groups: ViewGroups) -> Indices:
+    """Return the degrees of freedom of each position: two angles of each view, less three."""
+    n_used = np.bincount(groups.group, groups.used, minlength=len(groups.epoch_ns))
+    return np.maximum(2 * n_used.astype(np.int64) - 3, 1)
+
+
+def _refused(agreeing: Sequence[pl.DataFrame]) -> list[str]:
+    """Return the tracklets of which too few views agree."""
+    views = pl.concat([pl.DataFrame(schema=_AGREEING), *agreeing])
+    shares = views.group_by("tracklet_id").agg(pl.col("agrees").mean())
+    return sorted(shares.filter(pl.col("agrees") < MIN_AGREEING)["tracklet_id"])
+
+
+def without_refused(linked: pa.Table, refused: Sequence[str], names: Names) -> pa.Table:
+    """Return LINKED_TRACKLETS without those refused, nor a single one that is left of an object.
+
+    `names` has the objects that have other tracklets.
+    """
+    rows = to_polars(linked).filter(pl.col("tracklet_id").is_in(refused).not_())
+    known = {name for of_span in names.values() for name in of_span.values()}
+    several = (pl.len().over("object_id") > 1) | pl.col("object_id").is_in(list(known))
+    return from_polars(LINKED_TRACKLETS, rows.filter(several) if refused else rows)
 
 
 def _with_linked(

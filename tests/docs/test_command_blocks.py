@@ -2,6 +2,7 @@
 
 import os
 import re
+import shutil
 import subprocess
 import sys
 from importlib.util import find_spec
@@ -59,10 +60,9 @@ def pasted(block: str, folder: Path) -> subprocess.CompletedProcess[str]:
 
 @pytest.mark.long
 @pytest.mark.parametrize("page", RUN)
-def test_the_commands_of_a_page_run(page, folder):
+def test_the_commands_of_a_page_run(page, folder, example):
     if not any("epipole run examples/" in block for block in blocks(page)):
-        made = pasted("epipole run examples/four_sensor_geo.mcap --out out/", folder)
-        assert made.returncode == 0, made.stderr
+        shutil.copytree(example / "out", folder / "out")
     for block in blocks(page):
         if block.startswith(DEPLOYED) or ("orekit" in block and find_spec("orekit_jpype") is None):
             continue

@@ -1,9 +1,11 @@
 """Linked objects: where several sensors saw what an orbit joins, it has positions."""
 
+import numpy as np
 import polars as pl
 import pytest
-from scenes.associations import filled
+from scenes.associations import block_of, filled, tables, write_views
 from scenes.object_members import SECOND_NS, SPANS, members, ns, views_of, write_spans
+from scenes.tracklet_scenes import Scene
 
 from epipole.io.work.parts import JUDGED, NUMBERED, SOLVED, Parts, write_part
 from epipole.io.work.work_layout import SolvedParts
@@ -12,11 +14,13 @@ from epipole.schemas.settings import Settings
 from epipole.schemas.spans import DAY_NS
 from epipole.schemas.tables import POSITIONS, TRACKLETS
 from epipole.schemas.work_tables import LINKED_TRACKLETS, OBJECT_MEMBERS, SHARED_ERRORS
+from epipole.tasks.name import linked_objects
 from epipole.tasks.name.linked_objects import (
     LinkedMembers,
     add_linked_members,
     names_with_linked,
     tracklets_at_once,
+    without_refused,
 )
 from epipole.tasks.solve.sample_sight_lines import LineSampling
 from epipole.tasks.solve.solve_piece import Piece, solve_piece
@@ -25,6 +29,7 @@ MARGIN_NS = 30 * SECOND_NS
 SPAN, NEXT = SPANS[:2]
 # Tracklets: name, sensor, object, first and last second. Those of "x" are of an object.
 TEN = [*range(0, 10, 2)]
+AGREEING = linked_objects._AGREEING
 
 
 def tracklets(*rows):
@@ -66,6 +71,12 @@ def test_a_linked_tracklet_that_no_other_sensor_shares_does_not(other):
     assert named(at_once([("a", 0, "x", 0, 10), other], "a")) == []
 
 
+@pytest.fixture
+def all_meet(monkeypatch):
+    """Lines of sight that meet: these views have no directions."""
+    monkeypatch.setattr(linked_objects, "_agreeing_views", lambda *_: pl.DataFrame(schema=AGREEING))
+
+
 def solved_spans(folder, *rows, pieces=None):
     """Members of the first span, as `number_objects` leaves them; the next one has none."""
     solved = SolvedParts(folder / "solved")
@@ -82,7 +93,7 @@ def add(folder, solved, joined, seen, names, max_views=1000):
     viewed = write_spans(folder / "views", [views_of(k, of) for k, of in seen.items()])
     sensors = {f"s{k}": k for k in seen}
     return add_linked_members.fn(
-        joined, sensors, SPANS[:2], names, MARGIN_NS, max_views, viewed, solved
+        joined, sensors, SPANS[:2], names, MARGIN_NS, max_views, 4.5, viewed, solved
     )
 
 
@@ -102,7 +113,7 @@ OTHERS = [member(4, "p", 2), member(4, "q", 3)]
 SEEN = {2: {"p": TEN}, 3: {"q": TEN}}
 
 
-def test_two_linked_tracklets_are_a_new_object_in_a_piece_of_its_own(tmp_path):
+def test_two_linked_tracklets_are_a_new_object_in_a_piece_of_its_own(tmp_path, all_meet):
     solved = solved_spans(tmp_path, *OTHERS)
     joined = at_once([("a", 0, "x", 0, 8), ("b", 1, "x", 0, 8)], "ab")
     names = {SPAN.folder: {"20190401-00005": "w"}, NEXT.folder: {}}
@@ -119,7 +130,7 @@ def test_two_linked_tracklets_are_a_new_object_in_a_piece_of_its_own(tmp_path):
     assert not objects_of(solved).keys() - {*"abpq"}
 
 
-def test_a_linked_tracklet_joins_its_object_in_its_piece(tmp_path):
+def test_a_linked_tracklet_joins_its_object_in_its_piece(tmp_path, all_meet):
     solved = solved_spans(
         tmp_path, *OTHERS, member(7, "a", 0), member(7, "b", 1), pieces=[0, 0, 1, 1]
     )
@@ -132,7 +143,7 @@ def test_a_linked_tracklet_joins_its_object_in_its_piece(tmp_path):
     assert objects_of(solved)["p"] == (4, 0)
 
 
-def test_two_numbers_of_one_object_become_the_first(tmp_path):
+def test_two_numbers_of_one_object_become_the_first(tmp_path, all_meet):
     rows = [member(7, "a", 0), member(7, "b", 1), member(3, "d", 0), member(3, "e", 1)]
     solved = solved_spans(tmp_path, *OTHERS, *rows, pieces=[0, 0, 1, 1, 2, 2])
     joined = at_once([("a", 0, "x", 0, 8), ("c", 2, "x", 0, 8)], "c")
@@ -150,7 +161,7 @@ def test_two_numbers_of_one_object_become_the_first(tmp_path):
     )  # fmt: skip
 
 
-def test_tracklets_without_a_common_epoch_change_nothing(tmp_path):
+def test_tracklets_without_a_common_epoch_change_nothing(tmp_path, all_meet):
     solved = solved_spans(tmp_path, *OTHERS)
     joined = at_once([("a", 0, "x", 0, 8), ("b", 1, "x", 1, 9)], "ab")
     seen = {0: {"a": TEN}, 1: {"b": [1, 3, 5]}, **SEEN}
@@ -159,7 +170,7 @@ def test_tracklets_without_a_common_epoch_change_nothing(tmp_path):
     assert not solved.with_links().objects.holds(SPAN)
 
 
-def test_an_object_at_the_end_of_a_span_is_in_both(tmp_path):
+def test_an_object_at_the_end_of_a_span_is_in_both(tmp_path, all_meet):
     solved = solved_spans(tmp_path)
     end = (NEXT.start_ns - ns(0)) / SECOND_NS
     times = [end - 4, end - 2, end, end + 2]
@@ -172,6 +183,36 @@ def test_an_object_at_the_end_of_a_span_is_in_both(tmp_path):
         assert sum(rows["n_views"].to_pylist()) == 8
 
 
+def test_tracklets_whose_lines_of_sight_do_not_meet_are_refused(tmp_path):
+    """Of two objects, seen by four sensors, each object's own tracklets meet."""
+    of = tables(Scene(11, 4, times=np.arange(0.0, 60.0, 2.0)).objects(2, spread_km=300.0))
+    sensors = block_of(of).sensors
+    viewed, solved = write_views(tmp_path / "views", sensors, SPAN), solved_spans(tmp_path)
+    number = {each.sensor_id: each.number for each in sensors}
+    # The first four are of one object, the others of the second.
+    objects = {"t0000": "wrong", "t0005": "wrong", "t0002": "right", "t0003": "right"}
+    joined = (
+        pl.DataFrame(of.tracklets)
+        .with_columns(object_id=pl.col("tracklet_id").replace_strict(objects, default=None))
+        .drop_nulls("object_id")
+    )
+    columns = ["tracklet_id", "track_id", "sensor_id", "object_id", "start_time", "end_time"]
+    found = add_linked_members.fn(
+        joined.select(columns), number, [SPAN], {}, MARGIN_NS, 1000, 4.5, viewed, solved
+    )
+    assert found.refused == ["t0000", "t0005"]
+    assert set(objects_of(solved)) == {"t0002", "t0003"}
+
+
+def test_what_is_refused_leaves_no_single_tracklet_of_a_new_object():
+    rows = {"tracklet_id": list("abcdef"), "object_id": list("xxyyzw")}
+    linked = table(LINKED_TRACKLETS, rows)
+    names = {"span": {"1": "z"}}
+    assert without_refused(linked, [], names).equals(linked)
+    left = without_refused(linked, ["a"], names)
+    assert left["tracklet_id"].to_pylist() == ["c", "d", "e"]
+
+
 def test_objects_with_first_positions_have_their_names(tmp_path):
     solved = SolvedParts(tmp_path)
     for parts, name, piece in (
@@ -181,7 +222,7 @@ def test_objects_with_first_positions_have_their_names(tmp_path):
         tables = {key: empty(schema) for key, schema in SOLVED.items()}
         tables["positions"] = filled(POSITIONS, 1, {"object_id": [name]})
         write_part(parts.piece(SPAN, piece), SOLVED, tables)
-    found = LinkedMembers([Piece(SPAN, 1, 2)], {5: "w", 6: "x", 9: "other"})
+    found = LinkedMembers([Piece(SPAN, 1, 2)], {5: "w", 6: "x", 9: "other"}, [])
     before = {SPAN.folder: {"20190401-00005": "w"}, NEXT.folder: {"20190401-00010": "other"}}
     assert names_with_linked(before, solved.with_links(), found) == {
         SPAN.folder: {"20190401-00005": "w", "20190401-00006": "x"},
