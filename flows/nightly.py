@@ -222,7 +222,8 @@ def make_nights(order: Order, night: str | None) -> Summary:
                     LOGGER.info("night %s", date)
                 made = gave_something(frames.sources, frames.rejects, date)
                 recipe = recipe_of(night_logs_key(given, date, made), settings, known_key)
-                work = work_folder(work_root(out), date, recipe, settings.work.keep)
+                run_key = [*frames.sensors, *sorted(log.sha256 for log in frames.sources)]
+                work = work_folder(work_root(out), date, recipe, settings.work.keep, run_key)
                 folder = kept.enter_context(work)
                 rejects = into_nights(
                     concat(REJECTS, [given.rejects, frames.rejects]), nights, date

@@ -9,7 +9,7 @@ import contextlib
 import hashlib
 import logging
 import shutil
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import NamedTuple
 
@@ -31,7 +31,9 @@ NAME, KEPT = "work", "kept"
 
 
 @contextlib.contextmanager
-def work_folder(root: Path, night: str, recipe: Recipe, keep: bool = False) -> Iterator[WorkFolder]:
+def work_folder(
+    root: Path, night: str, recipe: Recipe, keep: bool = False, run: Iterable[str] = ()
+) -> Iterator[WorkFolder]:
     """Yield the folder for a night and its recipe. It is removed when the work succeeds.
 
     Other folders of the night are removed: they were made from other logs, settings or code. Where
@@ -42,9 +44,11 @@ def work_folder(root: Path, night: str, recipe: Recipe, keep: bool = False) -> I
     ----------
     keep
         Whether parts are kept, for a run with more logs, when the work succeeds.
+    run
+        The sensors and logs of the run; see `Recipe.work_key`.
     """
     made_with = recipe.made_with
-    folder = root / f"{NAME}-{night}-{made_with}-{recipe.work_key(night)}"
+    folder = root / f"{NAME}-{night}-{made_with}-{recipe.work_key(night, run)}"
     kept = root / f"{KEPT}-{night}-{made_with}"
     mine = {folder, kept}
     for path in mine:

@@ -28,9 +28,15 @@ class Recipe(NamedTuple):
         """A digest of what the parts of any logs depend on."""
         return digest_of((self.settings, self.star_catalogue, self.code))[:16]
 
-    def work_key(self, night: str) -> str:
-        """Return a digest of all that the parts of a night depend on; names are given later."""
-        return digest_of((self.logs, self.settings, night, self.star_catalogue, self.code))[:16]
+    def work_key(self, night: str, run: Iterable[str] = ()) -> str:
+        """Return a digest of all that the parts of a night depend on; names are given later.
+
+        `run` are the sensors and logs of the run, also of other nights: parts lie under the numbers
+        of sensors in the run, and a calibration holds from its log on.
+        """
+        return digest_of((self.logs, self.settings, night, self.star_catalogue, self.code, *run))[
+            :16
+        ]
 
 
 def recipe_of(logs: str, settings: Settings, known: str | None = None) -> Recipe:

@@ -252,7 +252,7 @@ def _with_linked(
 
     Objects stay in their pieces: that of their first number. New ones get pieces of their own.
     """
-    n_before = int(members["piece"].max()) + 1 if len(members) else 0
+    n_before = members["piece"].to_numpy().max(initial=-1) + 1
     changed = members.filter(pl.col("object").is_in(shared))
     pieces = changed.group_by("object").agg(pl.col("piece").min())
     linked = linked.filter(pl.col("object").is_in(shared))
@@ -264,9 +264,9 @@ def _with_linked(
         rest, known.join(pieces, on="object").select(rest.columns),
         new.with_columns(pl.col("piece") + n_before),
     ]).sort("piece", "object", "sensor", "tracklet_id", "first_epoch")  # fmt: skip
-    n_pieces = max(n_before, int(rows["piece"].max()) + 1)
+    n_pieces = max(n_before, rows["piece"].to_numpy().max() + 1)
     numbers = sorted({*changed["piece"], *range(n_before, n_pieces)})
-    return rows, [Piece(span, number, n_pieces) for number in numbers]
+    return rows, [Piece(span, number, int(n_pieces)) for number in numbers]
 
 
 def names_with_linked(names: Names, solved: SolvedParts, members: LinkedMembers) -> Names:

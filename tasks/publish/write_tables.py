@@ -195,10 +195,15 @@ def _of_spans(name: str, parts: NightParts) -> Iterator[pa.Table]:
 
 
 def _renamed(rows: pa.Table, names: Mapping[str, str]) -> pa.Table:
+    """Return the rows of named objects; one without a position in the span has none.
+
+    Its views are counted in `rejects`: no position could be solved from them.
+    """
     if "object_id" not in rows.column_names:
         return rows
     at = rows.schema.get_field_index("object_id")
     old = pa.array(list(names), pa.string())
+    rows = rows.filter(pc.is_in(rows["object_id"], old))
     new = pa.array(list(names.values()), pa.string())
     return rows.set_column(at, rows.schema.field(at), new.take(pc.index_in(rows["object_id"], old)))
 

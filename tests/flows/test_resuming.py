@@ -1,5 +1,6 @@
 """A run that was killed: the dataset is unchanged, and the next run reuses the finished parts."""
 
+import datetime
 import os
 import signal
 import subprocess
@@ -10,6 +11,11 @@ from pathlib import Path
 import pytest
 from scenes.dataset_tables import contents
 
+import epipole.flows.nightly as nightly_module
+from epipole.flows.nightly import nightly
+from epipole.flows.simulate import simulate
+from epipole.io.datasets.dataset import read_table
+from epipole.io.simulation.scenes import read_scene
 from epipole.io.work.folder import work_root
 
 pytestmark = pytest.mark.long
@@ -102,3 +108,31 @@ def test_two_runs_of_one_night_at_once_end_with_one_night(run, tmp_path, night_d
     for code, output in zip(codes, outputs, strict=True):
         assert code == 0 or "has worked on it since" in output
     assert contents(out) == contents(night_dataset)
+
+
+def test_a_new_sensor_of_another_day_takes_no_part_of_a_stopped_run(
+    prefect, night_log, night_dataset, tmp_path, monkeypatch
+):
+    """Parts lie under the numbers of sensors, and its id comes before the others."""
+    folder, out = tmp_path / "logs", tmp_path / "out"
+    folder.mkdir()
+    (folder / night_log.name).symlink_to(night_log)
+    with monkeypatch.context() as patch:
+        patch.setattr(nightly_module, "solve", _stopped)
+        with pytest.raises(KeyboardInterrupt):
+            nightly([str(folder)], str(out))
+    assert parts(out, "track/0/*")
+    scene = read_scene("four_sensor_geo")
+    scene = scene.model_copy(
+        update={"sensors": [scene.sensors[0].model_copy(update={"id": "aaa"})]}
+    )
+    later = datetime.datetime(2019, 4, 7, tzinfo=datetime.UTC)
+    simulate(scene, folder / "later.mcap", hours=3 / 3600, start=later)
+    nightly([str(folder)], str(out))
+    for table in ("frames", "stars", "tracklets", "observations"):
+        rows = read_table(str(out), table, NIGHT)
+        assert rows.equals(read_table(str(night_dataset), table, NIGHT))
+
+
+def _stopped(*_):
+    raise KeyboardInterrupt

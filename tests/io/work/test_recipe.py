@@ -22,6 +22,12 @@ def test_finished_parts_are_reused_only_for_the_same_logs_settings_and_nights():
     assert key != work_key([A, B], night="2019-04-02")
 
 
+def test_parts_lie_under_the_numbers_of_the_sensors_of_a_run():
+    recipe = recipe_of(logs_key([A]), Settings())
+    keys = {recipe.work_key(NIGHT, run) for run in ((), ("s1", "s2"), ("s0", "s1", "s2"))}
+    assert len(keys) == 3
+
+
 def test_names_are_given_after_the_parts_so_the_parts_do_not_depend_on_them():
     assert work_key([A]) == work_key([A], known="f00")
     assert recipe_of("", Settings()) != recipe_of("", Settings(), "f00")

@@ -2,14 +2,20 @@
 
 import numpy as np
 import pyarrow as pa
+import pyarrow.parquet as pq
 import pytest
+from scenes.associations import filled
 
+from epipole.io.datasets.night_tables import PART
+from epipole.io.work.parts import SOLVED, write_part
+from epipole.io.work.work_layout import SolvedParts
 from epipole.schemas.bridge import array, concat, empty
 from epipole.schemas.rejects import Reason, reject_rows
 from epipole.schemas.settings import Settings, TableSettings
-from epipole.schemas.spans import DAY_NS
-from epipole.schemas.tables import REJECTS, SOURCES, TABLES
+from epipole.schemas.spans import DAY_NS, SPAN_NS, Span
+from epipole.schemas.tables import ASSOCIATIONS, REJECTS, SOURCES, TABLES
 from epipole.schemas.work_tables import LogSource
+from epipole.tasks.publish.night_parts import NightParts
 from epipole.tasks.publish.write_tables import (
     BY_SENSOR,
     BY_SPAN,
@@ -19,6 +25,7 @@ from epipole.tasks.publish.write_tables import (
     into_nights,
     published_rows,
     source_table,
+    write_tables,
 )
 
 NIGHT = "2019-04-01"
@@ -43,6 +50,23 @@ def test_every_table_of_a_dataset_is_written_by_one_task():
     names = [*later, *(name for share in SHARES for name in share)]
     assert sorted(names) == sorted(TABLES)
     assert sorted((*later, *BY_SENSOR, *BY_SPAN, *WHOLE, "observations")) == sorted(TABLES)
+
+
+def test_views_of_an_object_without_a_position_in_a_span_are_left_out(tmp_path):
+    """All its epochs in the span may be ones from which no position could be solved."""
+    span = Span(MIDNIGHT_NS, MIDNIGHT_NS + SPAN_NS)
+    solved = SolvedParts(tmp_path / "solved")
+    pieces = {name: empty(schema) for name, schema in SOLVED.items()}
+    pieces["associations"] = filled(ASSOCIATIONS, 3, {
+        "object_id": ["solved", "unsolved", "solved"],
+        "epoch": [MIDNIGHT_NS + k for k in (1, 2, 3)],
+    })  # fmt: skip
+    write_part(solved.piece(span, 0), SOLVED, pieces)
+    names = {span.folder: {"solved": "20190401-00001"}}
+    parts = NightParts(NIGHT, [span], [span], [], solved, names, {})
+    write_tables.fn(["associations"], tmp_path / "night", parts)
+    rows = pq.read_table(tmp_path / "night" / "associations" / PART)
+    assert rows["object_id"].to_pylist() == ["20190401-00001"] * 2
 
 
 def test_what_every_span_counts_is_one_row_of_the_night():
