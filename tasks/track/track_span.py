@@ -119,11 +119,11 @@ def measure_runs(
     bias = np.take(sightings.cov_bias, order, axis=0)
     smooth, *_ = directions_at(first, last, t, 0.0, t, u, noise, bias, window_s)
     miss = lengths(u - smooth)
-    variance = traces(noise)
+    variance, from_prior = traces(noise), ~frames.from_stars[sightings.frame[order]]
     runs = []
     for lo, hi in itertools.pairwise(bounds):
         members = order[lo:hi]
-        rate, sigma = _mean_rate(t[lo:hi], u[lo:hi], variance[lo:hi])
+        rate, sigma = _mean_rate(t[lo:hi], u[lo:hi], variance[lo:hi], from_prior[lo:hi].any())
         rests = rate < max(STAR_RATE_SIGMA * sigma, STAR_DRIFT)
         still = rests and sigma < STAR_RATE_KNOWN
         residual = float(np.sqrt(np.mean(miss[lo:hi] ** 2) / 2)) / camera.pixel_rad
@@ -131,16 +131,20 @@ def measure_runs(
     return runs
 
 
-def _mean_rate(time_s: Array, u: Array, variance: Array) -> tuple[float, float]:
+def _mean_rate(time_s: Array, u: Array, variance: Array, from_prior: bool) -> tuple[float, float]:
     """Return the mean rate of a run and its 1-sigma error [rad/s].
 
-    `variance` is the trace of each direction's independent error [rad^2].
+    `variance` is the trace of each direction's independent error [rad^2]. What part of a prior
+    attitude's error changes from frame to frame no log says: `from_prior`, the run itself shows it.
     """
     t = time_s - time_s.mean()
     lever = float(np.sum(t * t))
     slope = t @ (u - u[0]) / lever
-    sigma = np.sqrt(np.mean(variance) / lever)
-    return float(np.linalg.norm(slope)), float(sigma)
+    mean = float(np.mean(variance))
+    if from_prior:
+        miss = u - u.mean(axis=0) - t[:, None] * slope
+        mean = max(mean, float(np.sum(miss**2)) / max(len(t) - 2, 1))
+    return float(np.linalg.norm(slope)), float(np.sqrt(mean / lever))
 
 
 # Tracklets: runs of detections of one object in the frames of one sensor.

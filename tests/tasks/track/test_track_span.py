@@ -294,6 +294,44 @@ def test_a_slow_drift_is_a_stars_and_a_faster_one_an_objects(rate_arcsec_s, kind
     assert kinds(rate_arcsec_s).count(kind) > 0.98 * N
 
 
+def kinds_under_a_prior(rate_arcsec_s, shaken_arcsec, n=20):
+    """Return the kinds of the detections of a point in `n` frames whose attitudes are priors.
+
+    Their errors differ from frame to frame; the image moves by three pixels a frame.
+    """
+    rng = np.random.default_rng(3)
+    camera = Camera(**CAMERA)
+    at_px = np.array([[400.0], [300.0]]) + rng.normal(0, shaken_arcsec / 21.1, (2, n))
+    at_px[0] += rate_arcsec_s * np.arange(n) / 21.1
+    ra, dec = radec_from_unit(unproject(camera, *at_px))
+    names = {"sensor_id": ["a"] * n, "frame_number": np.arange(n), "time": TIME_NS[:n]}
+    detections = filled(
+        DETECTIONS, n, **names, ra_deg=np.degrees(ra), dec_deg=np.degrees(dec),
+        sigma_arcsec=np.full(n, 2.1), kind=["unknown"] * n, x_px=50 + at_px[0] + 3 * np.arange(n),
+        y_px=at_px[1],
+    )  # fmt: skip
+    solutions = still_sensor().slice(0, n)
+    for name, values in {
+        "attitude_source": ["prior"] * n,
+        **{f"cov_att_{a}{a}_arcsec2": np.full(n, 400.0) for a in "xyz"},
+    }.items():
+        at = solutions.schema.get_field_index(name)
+        solutions = solutions.set_column(at, solutions.schema.field(at), pa.array(values))
+    built = tracked(solutions, detections, cameras_of({"a": camera}), Settings())
+    return built.detections["kind"].to_pylist()
+
+
+@pytest.mark.parametrize(
+    ("rate_arcsec_s", "shaken_arcsec", "kind"),
+    [(0.0, 0.0, "star_unlisted"), (0.0, 10.0, "star_unlisted"), (15.0, 10.0, "object")],
+)
+def test_a_prior_that_changes_from_frame_to_frame_makes_no_object_of_a_star(
+    rate_arcsec_s, shaken_arcsec, kind
+):
+    found = kinds_under_a_prior(rate_arcsec_s, shaken_arcsec)
+    assert found.count(kind) > 0.9 * len(found)
+
+
 def resting(runs_at, identified_at, rate_arcsec_s=0.0):
     """Return the kinds of the detections of a point that is detected in short runs, five frames
     each, and was identified as a star in other frames."""
