@@ -528,6 +528,13 @@ class LogCause(StrEnum):
         "explains it: they look at other objects, or the mistake is not known",
         "",
     )
+    VIEWS_TOO_VAGUE = (
+        "views_too_vague",
+        CheckVerdict.UNKNOWN,
+        "{percent:.0f} % of its views meet those of other sensors, but {share_percent:.0f} % would "
+        "without a common object: they are many, or their errors are large",
+        "",
+    )
     SENSORS_IN_DOUBT = (
         "sensors_in_doubt",
         CheckVerdict.WRONG,

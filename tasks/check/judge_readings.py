@@ -20,6 +20,7 @@ from epipole.tasks.algorithms.log_checks.findings import (
     Finding,
 )
 from epipole.tasks.algorithms.log_checks.meeting_lines import (
+    MIN_BETTER,
     MIN_STATED_SHARE,
     NamedReading,
     Sights,
@@ -47,8 +48,10 @@ def judge_readings(
     rows = pa.concat_tables(tables)
     names = sorted(set(rows["sensor_id"].to_pylist()))
     sights = _sights(rows, names)
-    share = shares_that_meet(sights)
-    found = {name: [_as_stated(float(share[k]))] for k, name in enumerate(names)}
+    share, by_accident = shares_that_meet(sights)
+    found = {
+        name: [_as_stated(float(share[k]), float(by_accident[k]))] for k, name in enumerate(names)
+    }
     for reading in find_reading(sights, _gcrf_from_teme(int(array(rows, "epoch")[0]))):
         finding = _finding(reading)
         concerned = {reading.sensor, reading.other} - {-1} or set(range(len(names)))
@@ -103,10 +106,13 @@ def _gcrf_from_teme(time_ns: int) -> np.ndarray:
     return to_gcrf(TEME, at, np.eye(3), np.zeros((3, 3)), orientation)[0].T
 
 
-def _as_stated(share: float) -> Finding:
+def _as_stated(share: float, by_accident: float) -> Finding:
     found = Finding(LINES_OF_SIGHT, SOUND, share, expected=1.0)
     if not share > MIN_STATED_SHARE:
         return found._replace(verdict=UNKNOWN, cause="no_common_objects")
+    if share - by_accident <= MIN_BETTER:
+        facts = {"share_percent": 100 * by_accident}
+        return found._replace(verdict=UNKNOWN, cause="views_too_vague", facts=facts)
     return found
 
 

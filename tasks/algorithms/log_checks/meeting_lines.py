@@ -18,6 +18,7 @@ from epipole.tasks.algorithms.earth_gravity import propagate_states
 
 GATE = 3.0  # sigmas of the distance from the plane
 UNRELATED_RAD = 0.02  # views that have nothing in common miss each other by about this, or more
+TURN_RAD, N_TURNS = 0.05, 4  # 1-sigma per axis, of views that shall have nothing in common
 MIN_SINE = 0.1  # of the angle between a view and the baseline: along it everything meets
 NEAREST_KM, FARTHEST_KM = 1.0, 2e5  # range of an object
 MEETS = 0.9  # share of the views that meet where the reading is right
@@ -109,11 +110,25 @@ def find_reading(sights: Sights, R_gcrf_from_teme: Array) -> list[NamedReading]:
     return found
 
 
-def shares_that_meet(sights: Sights) -> Array:
-    """Return the share of each sensor's views that meet one of another, as stated."""
-    _, meets = _odds(sights, sights.r_km)
+def shares_that_meet(sights: Sights) -> tuple[Array, Array]:
+    """Return the share of each sensor's views that meet one of another, as stated.
+
+    And the share of those that would without a common object: with many views, or large errors,
+    everything meets something. So it is with each sensor's views turned at random.
+    """
     n = np.maximum(np.bincount(sights.sensor), 1)
-    return np.asarray(np.bincount(sights.sensor, meets) / n)
+
+    def share_of(u: Array) -> Array:
+        meets = _odds(sights._replace(u=u), sights.r_km)[1]
+        return np.asarray(np.bincount(sights.sensor, meets) / n)
+
+    rng = np.random.default_rng(1)
+    turned = []
+    for _ in range(N_TURNS):
+        turn = rng.normal(0.0, TURN_RAD, (len(n), 3))[sights.sensor]
+        u = sights.u + np.cross(turn, sights.u)
+        turned.append(share_of(u / np.linalg.norm(u, axis=1, keepdims=True)))
+    return share_of(sights.u), np.mean(turned, axis=0)
 
 
 def _best(
@@ -154,8 +169,8 @@ def _odds(sights: Sights, r_km: Array, concerned: Flags | None = None) -> tuple[
         hit, chance = _pairs(sights, r_km, mine, rows)
         meets[mine] = hit.any(axis=1)
         log_missing[mine] = np.log1p(-np.minimum(chance, 0.999)).sum(axis=1)
-    by_chance = np.clip(1 - np.exp(log_missing), 1e-6, 1 - 1e-6)
-    odds = np.where(meets, np.log(MEETS / by_chance), np.log((1 - MEETS) / (1 - by_chance)))
+    by_accident = np.clip(1 - np.exp(log_missing), 1e-6, 1 - 1e-6)
+    odds = np.where(meets, np.log(MEETS / by_accident), np.log((1 - MEETS) / (1 - by_accident)))
     return np.minimum(odds, -np.log(1e-3)), meets
 
 

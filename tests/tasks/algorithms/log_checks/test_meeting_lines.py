@@ -67,7 +67,7 @@ def turned(r_km, offset_s):
 def test_nothing_is_named_where_lines_meet_or_have_nothing_in_common(seed):
     rng = np.random.default_rng(seed)
     sights = scene(rng)
-    assert (shares_that_meet(sights) > 0.9).all()
+    assert (shares_that_meet(sights)[0] > 0.9).all()
     assert find_reading(sights, R_TEME) == []
     assert find_reading(scene(rng, common=False), R_TEME) == []
 
@@ -109,4 +109,17 @@ def test_few_views_decide_nothing():
     assert find_reading(one, R_TEME) == []
     none = Sights(*(each[:0] for each in sights))
     assert find_reading(none, R_TEME) == []
-    assert len(shares_that_meet(none)) == 0
+    assert all(len(share) == 0 for share in shares_that_meet(none))
+
+
+@pytest.mark.parametrize("common", [True, False])
+@pytest.mark.parametrize("sigma_arcsec", [10.0, 1000.0])
+def test_views_that_would_meet_anyway_are_told_from_those_of_common_objects(common, sigma_arcsec):
+    sights = scene(np.random.default_rng(5), common)
+    sights = sights._replace(sigma_rad=np.full(len(sights.epoch), sigma_arcsec * ARCSEC))
+    meet, by_accident = shares_that_meet(sights)
+    # With the larger errors, the views of 27 other objects meet everywhere.
+    vague = sigma_arcsec > 100
+    assert (meet > 0.7).all() == (common or vague)
+    assert (by_accident > 0.7).all() == vague
+    assert (meet - by_accident > 0.5).all() == (common and not vague)
