@@ -92,10 +92,8 @@ class LogCheck(StrEnum):
         "the principal point is in the image",
     )
     IMAGE_SIZE = (
-        "image_size",
-        "Share of the centroids outside the image.",
-        "centroids lie in the image",
-    )
+        "image_size", "Share of the centroids outside the image.", "centroids lie in the image"
+    )  # fmt: skip
     FLUX = (
         "flux",
         "Where the median flux lies between the smallest and the largest, 0 to 1.",
@@ -106,11 +104,7 @@ class LogCheck(StrEnum):
         "Median exposure time over the median time from frame to frame.",
         "exposures end before the next frame",
     )
-    CALIBRATION = (
-        "calibration",
-        "Calibrations of the sensor.",
-        "there is a calibration",
-    )
+    CALIBRATION = "calibration", "Calibrations of the sensor.", "there is a calibration"
     CENTROID_SIGMA = (
         "centroid_sigma",
         "Scatter of the stars about their catalogue positions, per axis; expected: their stated "

@@ -250,7 +250,7 @@ def _with_linked(
 ) -> tuple[pl.DataFrame, list[Piece]]:
     """Return the members of a span with the linked ones, and the pieces that have changed.
 
-    Objects stay in their pieces: that of their first number. New ones get pieces of their own.
+    Objects stay in their pieces: that of their first number. New ones get further pieces.
     """
     n_before = members["piece"].to_numpy().max(initial=-1) + 1
     changed = members.filter(pl.col("object").is_in(shared))

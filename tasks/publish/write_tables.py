@@ -195,9 +195,9 @@ def _of_spans(name: str, parts: NightParts) -> Iterator[pa.Table]:
 
 
 def _renamed(rows: pa.Table, names: Mapping[str, str]) -> pa.Table:
-    """Return the rows of named objects; one without a position in the span has none.
+    """Return the rows of named objects.
 
-    Its views are counted in `rejects`: no position could be solved from them.
+    An object without a position in the span is not named: `rejects` counts its views.
     """
     if "object_id" not in rows.column_names:
         return rows
