@@ -37,10 +37,9 @@ class LogCheck(StrEnum):
         "all states are within the bounds",
     )
     ONE_SENSOR = (
-        "one_sensor",
-        "States or frames of a second sensor with the same id.",
+        "one_sensor", "States or frames of a second sensor with the same id.",
         "states and frames are of one sensor",
-    )
+    )  # fmt: skip
     SMOOTHNESS = (
         "smoothness",
         "States that lie off the path of those around them.",
