@@ -89,9 +89,10 @@ def name_known_objects(
     others = IDENTIFICATIONS.empty_table()
     if known is not None:
         verdicts, learnt = judge_objects(observed, known, settings.probability)
-        named = name_tracklets(folder, list(observed), learnt, settings.probability)
+        verdicts = _without_rivals(verdicts, times)
+        satellites = {name: _satellite(verdict) for name, verdict in verdicts.items()}
+        named = name_tracklets(folder, satellites, learnt, settings.probability)
         others = tracklet_rows(named, known)
-    verdicts = _without_rivals(verdicts, times)
     objects = sorted(observed.keys() | _seen_objects(folder) - set(others["object_id"].to_pylist()))
     rows = concat(IDENTIFICATIONS, [_rows(objects, verdicts, known), others])
     same_as = recognise_objects(folder, _unknown(rows), earlier, settings.earlier_h, link_log_odds)
@@ -103,8 +104,13 @@ def name_known_objects(
         return []
     return sensor_residuals(
         folder,
-        {n: known.sets[v.best.row] for n, v in verdicts.items() if v.status == "known" and v.best},
+        {n: known.sets[k] for n, v in verdicts.items() if (k := _satellite(v)) is not None},
     )
+
+
+def _satellite(verdict: NameVerdict) -> int | None:
+    """Return the row of the known satellite; None: it is not known."""
+    return verdict.best.row if verdict.status == "known" and verdict.best is not None else None
 
 
 def _unknown(rows: pa.Table) -> list[str]:
@@ -186,8 +192,8 @@ def _without_rivals(
     """
     named: dict[int, list[str]] = {}
     for name, verdict in verdicts.items():
-        if verdict.status == "known" and verdict.best is not None:
-            named.setdefault(verdict.best.row, []).append(name)
+        if (satellite := _satellite(verdict)) is not None:
+            named.setdefault(satellite, []).append(name)
     rivals = {
         name
         for names in named.values()

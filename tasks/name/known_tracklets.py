@@ -4,7 +4,7 @@ Objects that have no positions are named by their tracklets. The errors of the e
 once more, from the sure matches of the night's tracklets. Then all are judged with them.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import NamedTuple
 
@@ -69,7 +69,10 @@ class NamedTracklets(NamedTuple):
 
 
 def name_tracklets(
-    folder: Path, objects: Sequence[str], catalogue: KnownSatellites, min_probability: float
+    folder: Path,
+    objects: Mapping[str, int | None],
+    catalogue: KnownSatellites,
+    min_probability: float,
 ) -> NamedTracklets:
     """Return what a catalogue says of the tracklets of a night that belong to none of its objects.
 
@@ -82,7 +85,8 @@ def name_tracklets(
     folder
         The night's folder; its `tracklets` are written.
     objects
-        Ids of the objects that have positions, which are named by these.
+        The satellites of objects that have positions, which are named by these; None where an
+        object is no known one.
     catalogue
         Its errors of elements are those that the night's objects show.
     min_probability
@@ -90,7 +94,7 @@ def name_tracklets(
     """
     rows = pl.DataFrame(read_columns(folder, "tracklets", _COLUMNS))
     is_named = pl.col("object_id").is_in(list(objects)).fill_null(False)
-    rows = rows.filter(~is_named).sort("tracklet_id")
+    of_named, rows = rows.filter(is_named), rows.filter(~is_named).sort("tracklet_id")
     compared = np.flatnonzero(rows.select(HAS_DIRECTION).to_series().to_numpy())
     tracklets = _tracklets(rows[compared])
     pairs = match_tracklets(tracklets, catalogue)
@@ -100,7 +104,9 @@ def name_tracklets(
     weights = weights._replace(fits=_fits_all(weights.fits, pairs, rows, compared))
     names = judge_tracklets(len(rows), pairs, weights, min_probability)
     row = _deciding(names, rows)
-    names = _without_rivals(names, pairs, rows, row)
+    satellite = pl.Series([objects[name] for name in of_named["object_id"]], dtype=pl.Int64)
+    of_objects = of_named.with_columns(satellite=satellite).drop_nulls("satellite")
+    names = _without_rivals(names, pairs, rows, row, of_objects)
     kept = np.unique(row)
     object_id = rows["object_id"].gather(kept)
     tracklet_id = rows["tracklet_id"].gather(kept).set(object_id.is_not_null(), None)
@@ -166,19 +172,20 @@ def _learnt(tracklets: SeenTracklets, pairs: Pairs, catalogue: KnownSatellites) 
 
 
 def _without_rivals(
-    names: TrackletNames, pairs: Pairs, rows: pl.DataFrame, row: Indices
+    names: TrackletNames, pairs: Pairs, rows: pl.DataFrame, row: Indices, of_objects: pl.DataFrame
 ) -> TrackletNames:
     """Return the names; two tracks of one sensor at one time are not one satellite.
 
-    `row` is that of each tracklet's name. Tracklets of one object have one name.
+    `row` is that of each tracklet's name. Tracklets of one object have one name. `of_objects` are
+    the tracklets of objects whose positions have named a satellite.
     """
+    columns = ["sensor_id", "start_time", "end_time"]
     known = np.flatnonzero(names.status[row] == "known")
-    of = (
-        rows[known]
-        .select("sensor_id", "start_time", "end_time", owner=pl.coalesce("object_id", "track_id"))
-        .with_columns(row=row[known], satellite=pairs.satellite[names.pair[row[known]]])
-    )
-    both = of.join(of, on=["sensor_id", "satellite"], suffix="_other").filter(
+    of = rows[known].select(*columns, owner=pl.coalesce("object_id", "track_id"))
+    of = of.with_columns(row=row[known], satellite=pairs.satellite[names.pair[row[known]]])
+    others = of_objects.select(*columns, "satellite", owner="object_id")
+    others = pl.concat([of.select(others.columns), others])
+    both = of.join(others, on=["sensor_id", "satellite"], suffix="_other").filter(
         pl.col("owner") != pl.col("owner_other"),
         pl.col("start_time") <= pl.col("end_time_other"),
         pl.col("start_time_other") <= pl.col("end_time"),

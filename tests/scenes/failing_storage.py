@@ -208,12 +208,13 @@ def fail_at_random(folder: Path, faults: int, seed: int) -> Counter[tuple[str, s
     rng, counts = random.Random(seed), Counter[tuple[str, str]]()
     with embedded_prefect():
         runs = FailingRuns(folder)
-        calls = {reads: runs.calls(0, reads) for reads in (False, True)}
-        print(f"{calls[False]} calls write, {calls[True]} read", flush=True)
-        for number in range(1, faults + 1):
-            fault, log = [*FAULTS, VANISH][number % (len(FAULTS) + 1)], rng.randrange(2)
+        faulty = [[*FAULTS, VANISH][k % (len(FAULTS) + 1)] for k in range(1, faults + 1)]
+        calls = {reads: runs.calls(0, reads) for reads in {each.reads for each in faulty}}
+        print(", ".join(f"{calls[r]} calls {'read' if r else 'write'}" for r in calls), flush=True)
+        for number, fault in enumerate(faulty, 1):
+            log = rng.randrange(2)
             last = rng.random() < 0.5 and not fault.reads  # the last calls publish
-            at = rng.randint(max(calls[False] - 200, 1) if last else 1, calls[fault.reads])
+            at = rng.randint(max(calls[fault.reads] - 200, 1) if last else 1, calls[fault.reads])
             try:
                 if fault == VANISH:
                     ended = runs.vanish(log, rng.uniform(0.0, VANISHES_WITHIN_S))

@@ -279,6 +279,27 @@ def test_two_tracks_of_one_sensor_at_one_time_are_not_one_satellite(named, fleet
     assert found["name"].to_list() == ["SAT 0"] * 2
 
 
+@pytest.mark.parametrize(
+    ("of_sensor", "later_s", "status"),
+    [("sat0", 0.0, "ambiguous"), ("sat0", 5.0, "known"), ("sat1", 0.0, "known")],
+)
+def test_a_tracklet_beside_one_of_a_named_object_is_not_the_same_satellite(
+    named, fleet, of_sensor, later_s, status
+):
+    seen, _ = seen_from_near(fleet[:1], 1, np.random.default_rng(5))
+    twice = type(seen)(*(np.concatenate([column, column]) for column in seen))
+    shift = np.array([round(later_s * 1e9), 0])
+    made = as_table(
+        twice, ["t1", "t2"], object_id=["o", None], sensor_id=[of_sensor, "sat0"],
+        start_time=twice.time_ns + shift - 10**9, end_time=twice.time_ns + shift + 10**9,
+    )  # fmt: skip
+    at = (int(seen.time_ns[0]) - NIGHT_NS) / 1e9
+    rows, _ = named(
+        {"o": (fleet[0], seconds(at))}, ElementsOfNight("digest", fleet), tracklets=made
+    )
+    assert rows["status"].to_list() == ["known", status]
+
+
 def test_without_a_catalogue_tracklets_have_no_rows(named, fleet):
     seen, _ = seen_from_near(fleet, 3, np.random.default_rng(6))
     rows, _ = named({}, None, tracklets=as_table(seen, ["t1", "t2", "t3"]))
