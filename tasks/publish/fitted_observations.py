@@ -23,6 +23,7 @@ from epipole.tasks.algorithms.orbits.illumination import illumination, reduced_m
 from epipole.tasks.algorithms.orbits.orbit_determination import BACK_S
 from epipole.tasks.algorithms.orbits.trajectories import integrate, positions_at
 from epipole.tasks.common.stage_tasks import stage_task
+from epipole.tasks.publish.manoeuvres import Manoeuvre
 from epipole.tasks.publish.object_orbits import FittedOrbit, turned
 
 # Maximum time between positions that a straight line joins: it is within 1 km in low orbit.
@@ -40,6 +41,7 @@ def write_fitted(
     observed: pl.DataFrame,
     objects: Sequence[slice],
     orbits: Mapping[int, FittedOrbit],
+    manoeuvres: Mapping[int, Manoeuvre],
     positions: pl.DataFrame,
     origin_ns: int,
     around: Surroundings,
@@ -52,8 +54,8 @@ def write_fitted(
         OBSERVATIONS with the column `row`, by object.
     objects
         The rows of each object.
-    orbits
-        By the number of the object.
+    orbits, manoeuvres
+        By the number of the object. An orbit is that after a manoeuvre.
     positions
         POSITIONS of the objects without orbit, in order of time.
     origin_ns
@@ -66,6 +68,10 @@ def write_fitted(
         if k in orbits:
             time_s = (time_ns[rows] - origin_ns) / SECOND_NS
             r_km[rows] = _by_orbit(orbits[k], time_s, sensor_km[rows], around)
+            if k in manoeuvres:
+                before, n = manoeuvres[k].before, manoeuvres[k].n_before
+                early = slice(rows.start, rows.start + n)
+                r_km[early] = _by_orbit(before, time_s[:n], sensor_km[early], around)
             residual[rows] = np.sqrt(orbits[k].orbit.of_directions)
         elif (of_object := solved.get((observed["object_id"][rows.start],))) is not None:
             r_km[rows] = _by_positions(of_object, time_ns[rows], sensor_km[rows])

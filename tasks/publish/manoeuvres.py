@@ -40,14 +40,16 @@ MEETING_SIGMA_KM = 20.0
 class Manoeuvre(NamedTuple):
     """A change of an orbit.
 
-    after : FittedOrbit
-        The orbit after it; its `used` and `of_directions` are of all directions of the object.
+    before, after : FittedOrbit
+        The orbits before and after it. That after it has `used` and `of_directions` of all
+        directions of the object.
     time_s : float
         When, since the origin of the surroundings.
     n_before : int
         Number of directions before it.
     """
 
+    before: FittedOrbit
     after: FittedOrbit
     time_s: float
     n_before: int
@@ -93,7 +95,7 @@ def find_manoeuvre(
     if before is None or after is None or judge(before) or judge(after):
         return None
     time_s = _meeting(before, after, directions.time_s[cut - 1 : cut + 1], around)
-    return None if time_s is None else Manoeuvre(_of_all(after, cut, n), time_s, cut)
+    return None if time_s is None else Manoeuvre(before, _of_all(after, cut, n), time_s, cut)
 
 
 def _misfit(fitted: FittedOrbit | None) -> float:

@@ -112,8 +112,8 @@ def fit_orbits(
     without = {objects.names[k] for k in failed}
     positions = positions.filter(pl.col("object_id").is_in(without))
     write_fitted(
-        fitted_part(folder, share, shares), observed, objects.slices(), sound, positions, origin_ns,
-        around,
+        fitted_part(folder, share, shares), observed, objects.slices(), sound, changed, positions,
+        origin_ns, around,
     )  # fmt: skip
     times_ns = [objects.middle_ns(k) for k in failed]
     times_ns += [origin_ns + round(each.time_s * SECOND_NS) for each in changed.values()]

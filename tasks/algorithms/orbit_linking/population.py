@@ -29,7 +29,7 @@ COMPONENTS = 2
 # Integration over range, evenly in its logarithm, and over the range rates that are bound.
 MIN_RANGE_KM = 10.0
 MAX_RANGE_KM = 60_000.0
-N_RANGES = 72  # steps of 13 %
+N_RANGES = 72  # steps of 13 %; 144 and 288 found the same objects in a shell, within 0.2 %
 N_RATES = 96  # steps of 0.22 km/s at 500 km height, where `SIGMA` of most orbits is 0.15 km/s
 NEGLIGIBLE = 40.0  # chi-square beyond which the density is zero
 

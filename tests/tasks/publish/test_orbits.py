@@ -194,9 +194,17 @@ def test_a_change_of_the_orbit_is_found(tmp_path, truth, times_s, at_s, km_s):
     n_before, n_after = (len(each) for each in seen)
     assert abs(of_change["count"].item() - n_before) <= 0.1 * (n_before + n_after)
     complete_observations.fn(tmp_path, NIGHT, 1)
-    rows = to_polars(read_columns(tmp_path, "observations", ["time", "residual_sigma"]))
+    columns = ["time", "residual_sigma", "range_km", *POSITION]
+    rows = to_polars(read_columns(tmp_path, "observations", columns))
     is_after = rows["time"].cast(pl.Int64) > NOON_NS + found_s * 1e9
     assert (rows["residual_sigma"].is_not_null() == is_after).all()
+    # The orbit before the change tells the ranges before it.
+    for of, kept in ((truth, ~is_after), (later, is_after)):
+        of_part = rows.filter(kept)
+        seconds = (of_part["time"].cast(pl.Int64).to_numpy() - NOON_NS) / 1e9
+        there = np.array([gcrf(propagate_unknowns(of, 0.0, t, AROUND)[0])[:3] for t in seconds])
+        ranges = np.linalg.norm(there - of_part.select(POSITION).to_numpy(), axis=1)
+        np.testing.assert_allclose(of_part["range_km"].to_numpy(), ranges, atol=5.0)
 
 
 def test_vague_orbits_that_meet_by_their_errors_are_no_change_of_an_orbit(tmp_path):
