@@ -10,6 +10,7 @@ from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
+import polars as pl
 import pyarrow as pa
 
 from epipole.flows.night.progress import results
@@ -206,7 +207,7 @@ def _solve_pieces(night: _Night, pieces: Sequence[Piece], kept: Mapping[Span, Li
 def solve_linked(
     work: Work,
     solved: SolvedParts,
-    tracklets: pa.Table,
+    tracklets: pl.DataFrame,
     linked: pa.Table,
     names: Names,
     settings: Settings,

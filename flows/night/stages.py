@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
+import polars as pl
 import pyarrow as pa
 
 from epipole.flows.night.progress import flat, results, step
@@ -20,7 +21,7 @@ from epipole.flows.night.work import Spans, Work, count_frames, spans_of_night
 from epipole.io.catalogues.element_sets import KnownObjects
 from epipole.io.work.parts import IDENTIFIED, Parts, write_part
 from epipole.io.work.work_layout import ReadFolder, SolvedParts, WorkFolder
-from epipole.schemas.bridge import array, concat
+from epipole.schemas.bridge import array, concat, to_polars
 from epipole.schemas.rejects import ObjectVerdict, Reason
 from epipole.schemas.settings import EVERY_SENSOR, Settings
 from epipole.schemas.spans import DAY_NS, SPAN_NS, Span, day_of
@@ -55,6 +56,7 @@ from epipole.tasks.name.sensor_residuals import SensorResidual
 from epipole.tasks.publish.fitted_observations import complete_observations
 from epipole.tasks.publish.night_objects import write_objects
 from epipole.tasks.publish.night_parts import NightParts, publish_nights
+from epipole.tasks.publish.observed_objects import with_links
 from epipole.tasks.publish.orbits import OrbitRows, fit_orbits, orbit_shares, write_orbits
 from epipole.tasks.publish.share_out import share_out
 from epipole.tasks.publish.write_tables import SHARES, tracklets_of_night, write_tables
@@ -368,8 +370,9 @@ def _link(work: Work, parts: NightParts, settings: Settings) -> tuple[NightParts
     if not links.tracklets.num_rows:
         return parts, links.orbits
     LOGGER.info("linked %s by orbits", many(links.tracklets.num_rows, "tracklet"))
+    rows = to_polars(tracklets).with_columns(pl.col("object_id").replace(links.renamed))
     solved, names, linked = solve_linked(
-        work, parts.solved, tracklets_of_night(parts), links.tracklets, names, settings
+        work, parts.solved, with_links(rows, parts), links.tracklets, names, settings
     )
     return parts._replace(solved=solved, names=names, linked=linked), links.orbits
 

@@ -45,7 +45,7 @@ class LinkedMembers(NamedTuple):
     refused: list[str]
 
 
-def tracklets_at_once(tracklets: pa.Table, linked: pa.Table) -> pl.DataFrame:
+def tracklets_at_once(tracklets: pl.DataFrame, linked: pa.Table) -> pl.DataFrame:
     """Return the linked tracklets that may have an epoch with another sensor's of their object.
 
     Parameters
@@ -61,7 +61,7 @@ def tracklets_at_once(tracklets: pa.Table, linked: pa.Table) -> pl.DataFrame:
         tracklet_id, track_id, sensor_id, object_id, start_time, end_time.
     """
     columns = ["tracklet_id", "track_id", "sensor_id", "object_id", "start_time", "end_time"]
-    rows = to_polars(tracklets).select(columns).drop_nulls("object_id")
+    rows = tracklets.select(columns).drop_nulls("object_id")
     is_linked = pl.col("tracklet_id").is_in(linked["tracklet_id"].to_pylist())
     rows = rows.with_columns(linked=is_linked).filter(pl.col("linked").any().over("object_id"))
     rows = rows.sort("object_id", "start_time", "tracklet_id")

@@ -43,7 +43,7 @@ def tracklets(*rows):
 
 def at_once(rows, linked):
     columns = {"tracklet_id": list(linked), "object_id": ["x"] * len(linked)}
-    return tracklets_at_once(tracklets(*rows), table(LINKED_TRACKLETS, columns))
+    return tracklets_at_once(pl.DataFrame(tracklets(*rows)), table(LINKED_TRACKLETS, columns))
 
 
 def named(joined):
