@@ -73,7 +73,8 @@ def nights_in(dataset: Where) -> list[str]:
 def check_sources(dataset: Where, nights: Sequence[str], sources: pa.Table, replace: bool) -> None:
     """Raise where a published night was made from a log that is not among these sources.
 
-    A log of the same name that is not smaller is that log: it was still being written, or copied.
+    A changed log of the same name that is not smaller is that log: it was still being written, or
+    copied. A log that is recorded itself never stands for another one.
 
     Raises
     ------
@@ -83,23 +84,36 @@ def check_sources(dataset: Where, nights: Sequence[str], sources: pa.Table, repl
     if replace:
         return
     columns = ["name", "size", "sha256"]
+    recorded = {
+        night: read_table(dataset, "sources", night, columns).to_pylist() for night in nights
+    }
+    known = {row["sha256"] for rows in recorded.values() for row in rows}
     rows = sources.select(columns).to_pylist()
     given = {row["sha256"] for row in rows}
-    sizes: dict[str, int] = {}
-    for row in rows:
-        sizes[row["name"]] = max(row["size"], sizes.get(row["name"], 0))
+    changed = [row for row in rows if row["sha256"] not in known]
     for night in nights:
-        recorded = read_table(dataset, "sources", night, columns).to_pylist()
-        missing = [
-            row["name"]
-            for row in recorded
-            if row["sha256"] not in given and row["size"] > sizes.get(row["name"], -1)
-        ]
-        if missing:
+        gone = [row for row in recorded[night] if row["sha256"] not in given]
+        if missing := _not_among(gone, changed):
             raise DatasetError(
                 f"{dataset}/night={night}: was also made from {', '.join(missing)}; "
                 "give all logs of the night, or --replace to publish it without them"
             )
+
+
+def _not_among(gone: Sequence[dict[str, Any]], changed: Sequence[dict[str, Any]]) -> list[str]:
+    """Return the names of the logs of which none of these is a later form, each of one at most."""
+    sizes: dict[str, list[int]] = {}
+    for row in sorted(changed, key=lambda row: row["size"]):
+        sizes.setdefault(row["name"], []).append(row["size"])
+    missing = []
+    for row in sorted(gone, key=lambda row: (row["name"], row["size"])):
+        larger = sizes.get(row["name"], [])
+        fit = next((size for size in larger if size >= row["size"]), None)
+        if fit is None:
+            missing.append(row["name"])
+        else:
+            larger.remove(fit)
+    return missing
 
 
 def read_table(

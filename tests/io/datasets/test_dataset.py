@@ -29,6 +29,7 @@ from epipole.io.datasets.dataset import (
     read_table,
     write_beside,
 )
+from epipole.schemas.bridge import from_polars
 from epipole.schemas.columns import TIME
 from epipole.schemas.errors import DatasetError
 from epipole.schemas.tables import TABLES
@@ -105,6 +106,58 @@ def test_a_run_without_a_recorded_log_is_refused_and_names_it(tmp_path):
     assert contents(tmp_path) == before
     publish(tmp_path, night_tables(TIMES, ("a", "c")), [NIGHT], replace=True)
     assert read_table(tmp_path, "sources", NIGHT)["name"].to_pylist() == ["a.mcap", "c.mcap"]
+
+
+def _logs(*logs: tuple[str, int, str], times: np.ndarray = TIMES) -> dict[str, pa.Table]:
+    """Return tables of a night from logs, each of a name, a size and what makes its digest."""
+    tables = night_tables(times, tuple(digest for *_, digest in logs))
+    sources = pl.from_arrow(tables["sources"]).with_columns(
+        name=pl.Series([name for name, *_ in logs]), size=pl.Series([size for _, size, _ in logs])
+    )
+    return tables | {"sources": from_polars(TABLES["sources"], sources)}
+
+
+# Two folders have a log of this name each.
+BOTH = ("night.mcap", 467, "a"), ("night.mcap", 462, "b")
+
+
+@pytest.mark.parametrize(
+    "given",
+    [
+        BOTH[:1],  # recorded itself: it is no later form of the other one
+        BOTH[1:],
+        [BOTH[0], ("night.mcap", 461, "c")],  # has become smaller
+        [("night.mcap", 468, "c")],  # one changed log is not both
+        [("night.mcap", 463, "c"), ("night.mcap", 466, "d")],
+    ],
+)
+def test_a_log_of_the_same_name_does_not_stand_for_a_missing_one(tmp_path, given):
+    publish(tmp_path, _logs(*BOTH), [NIGHT])
+    before = contents(tmp_path)
+    with pytest.raises(DatasetError, match=r"was also made from night\.mcap;"):
+        publish(tmp_path, _logs(*given), [NIGHT])
+    assert contents(tmp_path) == before
+
+
+@pytest.mark.parametrize(
+    "given",
+    [
+        [BOTH[1], ("night.mcap", 468, "c")],
+        [("night.mcap", 463, "c"), ("night.mcap", 468, "d")],
+        [("night.mcap", 468, "d"), ("night.mcap", 462, "c"), ("night.mcap", 467, "e")],
+    ],
+)
+def test_logs_of_one_name_that_have_grown_replace_their_night(tmp_path, given):
+    publish(tmp_path, _logs(*BOTH), [NIGHT])
+    publish(tmp_path, _logs(*given), [NIGHT])
+    assert read_table(tmp_path, "sources", NIGHT).num_rows == len(given)
+
+
+def test_a_log_that_another_night_of_the_run_records_is_no_later_form_of_a_missing_one(tmp_path):
+    publish(tmp_path, _logs(BOTH[1]), [NIGHT])
+    publish(tmp_path, _logs(BOTH[0], times=OVER_MIDNIGHT), [NEXT_NIGHT])
+    with pytest.raises(DatasetError, match=r"night=2019-04-01: was also made from night\.mcap;"):
+        publish(tmp_path, _logs(BOTH[0], times=OVER_MIDNIGHT), [NIGHT, NEXT_NIGHT])
 
 
 def test_one_refused_night_stops_all_nights_of_the_run(tmp_path):
