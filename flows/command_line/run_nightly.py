@@ -24,7 +24,12 @@ from epipole.io.caches.kernel_compiler import (
 from epipole.io.caches.kernels import kernel_folder
 from epipole.io.catalogues.element_sets import read_known_objects
 from epipole.io.catalogues.star_catalogue import check_star_catalogue
-from epipole.io.datasets.dataset import check_folder, night_location, nights_in
+from epipole.io.datasets.dataset import (
+    check_folder,
+    finish_publication,
+    night_location,
+    nights_in,
+)
 from epipole.io.logs.listing import list_logs
 from epipole.io.settings_file import read_settings
 from epipole.schemas.errors import EpipoleError, NoFramesError
@@ -141,6 +146,7 @@ class Nights:
         Each is judged when those before it are made: it may depend on them.
         """
         given = find_logs(self._logs, None, self._logged)
+        finish_publication(self._out)
         for date in nights_in(self._out):
             night = published_night(self._out, date, self._settings, self._known_key, given)
             if night.stale:

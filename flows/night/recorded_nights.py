@@ -24,6 +24,7 @@ import pyarrow as pa
 from epipole.flows.night.log_choice import FoundLogs, end_ns, name_of
 from epipole.flows.night.summary import count
 from epipole.io.datasets.dataset import (
+    finish_publication,
     missing_tables,
     night_row,
     nights_in,
@@ -371,8 +372,15 @@ def unchanged_nights(
     Notes
     -----
     Logs are the same where their bytes are: they are read once, to be hashed, and only if their
-    names are those of the published night. Logs that give nothing do not count.
+    names are those of the published night. Logs that give nothing do not count. Nights that an
+    earlier run has published and not finished are finished before.
+
+    Raises
+    ------
+    DatasetError
+        Where these cannot be finished.
     """
+    finish_publication(dataset)
     try:
         rows = _rows(dataset, night)
         made_so = {

@@ -332,6 +332,21 @@ def lock_nights(dataset: Where, nights: Sequence[str]) -> Iterator[Path]:
         yield work
 
 
+def finish_publication(dataset: Where) -> None:
+    """Put the files in place of nights that a run has published and not finished.
+
+    Readers of a store take such nights from where they are staged; other programs do not.
+
+    Raises
+    ------
+    DatasetError
+        Where they cannot be put in place.
+    """
+    storage = night_storage(dataset)
+    with _writing(dataset, storage):
+        storage.recover()
+
+
 def publish_folders(
     dataset: Where, staged: Mapping[str, Path], sources: pa.Table, replace: bool = False
 ) -> None:

@@ -156,6 +156,10 @@ class LocalNights:
         """Return whether the folder exists; it may be empty."""
         return self.folder.is_dir()
 
+    def recover(self) -> None:
+        """Finish what a stopped run has committed; readers do so too."""
+        recover(self.folder)
+
     def nights(self) -> list[str]:
         """Return the published nights, in order."""
         recover(self.folder)

@@ -19,7 +19,7 @@ from epipole.io.datasets.table_pieces import (
     unreadable,
     within_bounds,
 )
-from epipole.io.paths import file_system, storage_errors
+from epipole.io.paths import file_system, shown_error, storage_errors
 from epipole.schemas.arrays import Integers
 from epipole.schemas.bridge import conform, to_polars
 from epipole.schemas.errors import DatasetError
@@ -226,7 +226,13 @@ def _writer(folder: Path, schema: pa.Schema) -> pq.ParquetWriter:
 
 
 def read_columns(night: Where, name: str, columns: Sequence[str]) -> pa.Table:
-    """Return some columns of a table that `write_table` wrote."""
+    """Return some columns of a table that `write_table` wrote.
+
+    Raises
+    ------
+    DatasetError
+        Where the file is missing or cannot be read.
+    """
     with _opened(night, name) as file:
         return pq.read_table(file, columns=list(columns), partitioning=None)
 
@@ -249,7 +255,7 @@ def take_rows(night: Path, name: str, columns: Sequence[str], rows: Integers) ->
 
 
 def count_rows(night: Where, name: str) -> int:
-    """Return the number of rows of a table that `write_table` wrote."""
+    """Return the number of rows of a table that `write_table` wrote; errors as `read_columns`."""
     with _opened(night, name) as file:
         rows: int = pq.read_metadata(file).num_rows
     return rows
@@ -258,10 +264,15 @@ def count_rows(night: Where, name: str) -> int:
 @contextlib.contextmanager
 def _opened(night: Where, name: str) -> Iterator[Any]:
     """Open a table's file. Of a URL only the ranges that are read are fetched."""
-    if isinstance(night, Path):
-        yield (night / name / PART).absolute()
-        return
-    storage, path = file_system(f"{night}/{name}/{PART}")
-    storage.invalidate_cache()  # an earlier listing may be out of date
-    with storage.open(path, cache_type="readahead") as file:
-        yield file
+    try:
+        if isinstance(night, Path):
+            yield (night / name / PART).absolute()
+            return
+        storage, path = file_system(f"{night}/{name}/{PART}")
+        storage.invalidate_cache()  # an earlier listing may be out of date
+        with storage.open(path, cache_type="readahead") as file:
+            yield file
+    except DatasetError:
+        raise
+    except (KeyError, pa.ArrowException, *storage_errors()) as error:
+        raise unreadable(f"{night}/{name}", error) from shown_error(error)

@@ -69,6 +69,9 @@ class NightStorage(Protocol):
     def locked_nights(self) -> set[str]:
         """Return the nights that living runs have locked."""
 
+    def recover(self) -> None:
+        """Finish what stopped runs have committed, except on nights that another run has locked."""
+
     def publish(self, staged: Mapping[str, Path], check: Callable[[], None]) -> None:
         """Put the folders of nights in place, all or none.
 

@@ -16,12 +16,14 @@ from scenes.dataset_tables import NEXT_NIGHT, NIGHT, OVER_MIDNIGHT, TIMES, night
 from scenes.published import publish as publish_once
 from scenes.twice import twice
 
+from epipole.flows.command_line.run_nightly import Nights, RunOptions
 from epipole.flows.evaluate import evaluate
 from epipole.flows.night.recorded_nights import published_nights
 from epipole.flows.nightly import nightly
 from epipole.io.datasets import dataset, object_store
 from epipole.io.datasets.dataset import lock_nights
 from epipole.io.datasets.lock_record import LockRecord
+from epipole.io.datasets.night_tables import count_rows, read_columns
 from epipole.io.datasets.object_store import store_nights
 from epipole.schemas.errors import DatasetError
 from epipole.schemas.settings import Settings
@@ -251,6 +253,80 @@ def test_a_commit_that_is_written_though_the_store_says_not_leaves_no_broken_nig
     publish_once(out, night_tables(TIMES), [NEXT_NIGHT])
     assert read_table(out, "frames", NIGHT).num_rows == found
     assert [p for p in s3.find(out) if "/.staging/" in p] == []
+
+
+@pytest.fixture
+def no_copies(s3, out, monkeypatch):
+    """Return a context in which the store refuses to copy: a night is committed, not in place."""
+
+    def refuse(*_):
+        raise PermissionError("Access Denied")
+
+    @contextlib.contextmanager
+    def refused():
+        with monkeypatch.context() as patched:
+            patched.setattr(store_nights(out)._storage, "cp_file", refuse)
+            yield
+
+    return refused
+
+
+def publish_folder(out, folder):
+    """Publish the night of another dataset, as the run that made it does."""
+    sources = dataset.read_table(folder, "sources", NIGHT)
+    staged = {NIGHT: folder / f"night={NIGHT}"}
+    dataset.publish_folders(out, staged, sources, replace=True)
+
+
+@pytest.mark.parametrize("there_before", [False, True])
+def test_the_same_run_again_finishes_what_the_store_refused_to_copy(
+    s3, out, no_copies, there_before, prefect, night_log, night_dataset
+):
+    if there_before:
+        publish_once(out, night_tables(TIMES), [NIGHT])
+        s3.pipe_file(f"{out}/night={NIGHT}/frames/part-1.parquet", b"of an older version")
+    with no_copies():
+        with pytest.raises(DatasetError, match=r"Access Denied.*; run again to finish this"):
+            publish_folder(out, night_dataset)
+        with pytest.raises(DatasetError, match="Access Denied"):
+            nightly([str(night_log)], out)
+    assert nightly([str(night_log)], out).unchanged
+    new = {f"{name}/part-0.parquet" for name in TABLES}
+    found = {path.partition(f"night={NIGHT}/")[2] for path in s3.find(out) if "/night=" in path}
+    assert found == new
+    for name in new:
+        there = (night_dataset / f"night={NIGHT}" / name).read_bytes()
+        assert s3.cat_file(f"{out}/night={NIGHT}/{name}") == there
+    assert [path for path in s3.find(out) if "/.staging/" in path] == []
+
+
+def test_a_run_of_stale_nights_finishes_them_before_it_judges_them(
+    s3, out, no_copies, night_log, night_dataset
+):
+    with no_copies(), pytest.raises(DatasetError, match="run again to finish this"):
+        publish_folder(out, night_dataset)
+    assert list(Nights([str(night_log)], out, RunOptions()).stale()) == []
+    assert [path for path in s3.find(out) if "/.staging/" in path] == []
+
+
+def test_a_night_that_another_run_has_locked_is_not_finished_for_it(s3, out, no_copies):
+    with no_copies(), pytest.raises(DatasetError, match="run again to finish this"):
+        publish_once(out, night_tables(TIMES), [NIGHT])
+    other = object_store.StoreLocks(s3, store_nights(out)._root, out)
+    with other.lock([NIGHT]):
+        dataset.finish_publication(out)
+        assert s3.find(f"{out}/night={NIGHT}") == []
+    dataset.finish_publication(out)
+    assert [path for path in s3.find(out) if "/.staging/" in path] == []
+    assert read_table(out, "frames", NIGHT).num_rows == len(TIMES)
+
+
+def test_a_table_that_is_missing_in_a_store_is_an_error_of_one_line(s3, out):
+    where = f"{out}/night={NIGHT}"
+    for read in (count_rows, lambda *table: read_columns(*table, ["time"])):
+        with pytest.raises(DatasetError, match=f"{where}/frames: cannot be read") as caught:
+            read(where, "frames")
+        assert "\n" not in str(caught.value)
 
 
 def test_what_another_run_has_finished_or_cleared_meanwhile_stops_nothing(s3, out, monkeypatch):
