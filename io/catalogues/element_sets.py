@@ -4,12 +4,12 @@ import csv
 import hashlib
 import json
 import math
+import re
 import xml.etree.ElementTree as ET
 from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import pyarrow as pa
 from sgp4 import omm
 from sgp4.api import WGS72, Satrec
 from sgp4.io import compute_checksum
@@ -24,6 +24,13 @@ _UNIX_EPOCH_JD = 2440587.5
 _SGP4_EPOCH_JD = 2433281.5  # 1949 December 31, 0h
 _DAY_NS = 86_400_000_000_000
 _LINE_LENGTH = 69
+_TYPE = 62  # the column of line 1 with the ephemeris type
+# A line of elements however much of it was cut off, and not a name: it has the satellite's number.
+_CUT = re.compile(r"1 [ 0-9A-Z][ 0-9]{4}([A-Z ]|$)|2 [ 0-9A-Z][ 0-9]{4}( |$)")
+# Elements for other theories, such as SGP4-XP, mean another orbit.
+_THEORIES = ("SGP4", "SGP", "SGP/SGP4")
+_XP = "4"  # the ephemeris type of SGP4-XP
+_OF_XP = "its ephemeris type is 4 (SGP4-XP), expected SGP4"
 _MEAN = ("bstar", "ndot", "nddot", "ecco", "argpo", "inclo", "mo", "no_kozai", "nodeo")
 
 
@@ -72,10 +79,10 @@ def _parsed(text: str, data: bytes) -> Iterator[ElementSet | Fault]:
 def _two_line_sets(text: str) -> Iterator[ElementSet | Fault]:
     title, first, number = "", None, 0
     for number, raw in enumerate(text.splitlines(), start=1):
-        line = raw.rstrip()
+        line = raw.strip()
         if not line or line.startswith("#"):
             continue
-        is_long = len(line) >= _LINE_LENGTH - 1
+        is_elements = len(line) >= _LINE_LENGTH - 1 or _CUT.match(line) is not None
         if first is not None and line.startswith("2 "):
             yield _two_line_set(title, first, (number, line))
             title, first = "", None
@@ -84,9 +91,9 @@ def _two_line_sets(text: str) -> Iterator[ElementSet | Fault]:
             what = f"expected line 2 of the elements, found {line[:20]!r}"
             yield Fault(f"line {number}", what)
             title, first = "", None
-        if line.startswith("1 ") and is_long:
+        if line.startswith("1 ") and is_elements:
             first = number, line
-        elif line.startswith("2 ") and is_long:
+        elif line.startswith("2 ") and is_elements:
             yield Fault(f"line {number}", "line 2 of the elements without line 1")
             title = ""
         else:
@@ -101,6 +108,8 @@ def _two_line_set(title: str, *lines: tuple[int, str]) -> ElementSet | Fault:
         if (what := _fault_of(line)) is not None:
             return Fault(f"line {number}", what)
     first, second = (line[:_LINE_LENGTH] for _, line in lines)
+    if first[_TYPE] == _XP:
+        return Fault(f"line {lines[0][0]}", _OF_XP)
     try:
         satellite = Satrec.twoline2rv(first, second, WGS72)
         if first[2:7] != second[2:7]:
@@ -115,6 +124,8 @@ def _fault_of(line: str) -> str | None:
     body = line[:_LINE_LENGTH]
     if len(body) < _LINE_LENGTH:
         return f"{len(body)} characters; elements have {_LINE_LENGTH}"
+    if not body.isascii():
+        return "has other characters than ASCII"
     if body[-1] != str(compute_checksum(body)):
         return f"its checksum is {body[-1]}, expected {compute_checksum(body)}"
     return None
@@ -138,9 +149,16 @@ def _json_messages(text: str) -> list[Mapping[str, Any]]:
 
 def _xml_messages(data: bytes) -> list[Mapping[str, Any]]:
     try:
-        return list(omm.parse_xml(pa.BufferReader(data)))
-    except (ET.ParseError, AttributeError, TypeError, LookupError) as error:
+        root = ET.fromstring(data)
+    except (ET.ParseError, LookupError, ValueError) as error:
         raise CatalogueError(f"not an OMM in XML: {error}") from error
+    return [_segment_fields(segment) for segment in root.iterfind(".//segment")]
+
+
+def _segment_fields(segment: ET.Element) -> dict[str, Any]:
+    """Return the keywords of a segment, of as many of its parts as it has."""
+    parts = ("metadata", "data/meanElements", "data/tleParameters")
+    return {field.tag: field.text for part in parts for field in segment.iterfind(f"{part}/*")}
 
 
 def _csv_messages(text: str) -> Iterator[Mapping[str, Any]]:
@@ -181,8 +199,10 @@ def _with_defaults(fields: dict[str, str]) -> dict[str, str]:
         "CLASSIFICATION_TYPE": "U", "OBJECT_ID": "", "EPHEMERIS_TYPE": "0",
         "ELEMENT_SET_NO": "0", "REV_AT_EPOCH": "0",
     }  # fmt: skip
-    if not fields.get("MEAN_ELEMENT_THEORY", "SGP4").startswith("SGP"):
+    if fields.get("MEAN_ELEMENT_THEORY", "SGP4") not in _THEORIES:
         raise ValueError(f"MEAN_ELEMENT_THEORY is {fields['MEAN_ELEMENT_THEORY']}, expected SGP4")
+    if fields.get("EPHEMERIS_TYPE") == _XP:
+        raise ValueError(_OF_XP)
     epoch = fields["EPOCH"].removesuffix("Z")
     # sgp4 refuses the numbers above 339999, which two-line elements cannot hold.
     changed = {"EPOCH": epoch if "." in epoch else f"{epoch}.0", "NORAD_CAT_ID": "0"}

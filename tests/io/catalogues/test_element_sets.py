@@ -7,6 +7,7 @@ import pytest
 from scenes.satellites import LINES, two_lines
 from sgp4.api import Satrec
 from sgp4.exporter import export_omm
+from sgp4.io import compute_checksum
 
 from epipole.io.catalogues.element_sets import read_known_objects
 from epipole.schemas.errors import CatalogueError
@@ -28,6 +29,29 @@ def test_a_catalogue_has_its_sets_and_the_digest_of_its_bytes(tmp_path):
     assert known.sha256 == hashlib.sha256(GOOD.encode()).hexdigest()
 
 
+def of_type(number):
+    """Return line 1 of the space station with another ephemeris type."""
+    line = f"{LINES[0][:62]}{number}{LINES[0][63:68]}"
+    return f"{line}{compute_checksum(line)}"
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        GOOD.replace("\n", "\n "),
+        "\n".join(f"\t {line}" for line in GOOD.splitlines()),
+        f"1 SAT\n{GOOD}",
+        f"2 2019 a\n{GOOD}",
+        f"ISS (ZARYA)\n{of_type(0)}\n{LINES[1]}",
+        f"ISS (ZARYA)\n{of_type(2)}\n{LINES[1]}",
+    ],
+)
+def test_lines_may_be_indented_and_names_begin_with_a_number(text, tmp_path):
+    known = read_known_objects(write(tmp_path / "a.tle", text))
+    assert [(each.name, each.number) for each in known.sets] == [("ISS (ZARYA)", 25544)]
+    assert known.faults == []
+
+
 @pytest.mark.parametrize(
     ("text", "what"),
     [
@@ -36,6 +60,13 @@ def test_a_catalogue_has_its_sets_and_the_digest_of_its_bytes(tmp_path):
         (GOOD + "\n" + LINES[0][:-1] + "9\n" + LINES[1], "its checksum is 9"),
         (GOOD + "\n" + LINES[0] + "\n" + two_lines("2", 13.0)[1], "line 1 is of 25544"),
         (GOOD + "\n" + LINES[0], "ends after line 1"),
+        (GOOD + f"\nX\n{LINES[0][:60]}\n{LINES[1][:60]}", "line 5: 60 characters; elements have"),
+        (GOOD + f"\nX\n{LINES[0][:7]}\n{LINES[1][:7]}", "line 5: 7 characters"),
+        (GOOD + f"\nX\n{LINES[0]}\n{LINES[1][:7]}", "line 6: 7 characters"),
+        (GOOD + "\n" + LINES[1][:60], "line 2 of the elements without line 1"),
+        (GOOD + f"\n{LINES[0].replace('11776', '1177²')}\n{LINES[1]}", "line 4: has other char"),
+        (GOOD + f"\n{LINES[0]}\n{LINES[1][:68]}²", "line 5: has other characters"),
+        (GOOD + f"\n{of_type(4)}\n{LINES[1]}", "line 4: its ephemeris type is 4 (SGP4-XP), exp"),
     ],
 )
 def test_one_bad_record_is_told_and_the_others_are_read(text, what, tmp_path):
@@ -56,6 +87,7 @@ def omm(**changed):
         {"MEAN_MOTION": "fast"}, {"MEAN_MOTION": "0"}, {"MEAN_MOTION": "nan"},
         {"ECCENTRICITY": 1.5}, {"EPOCH": "yesterday"}, {"NORAD_CAT_ID": None},
         {"MEAN_ELEMENT_THEORY": "DSST"}, {"MEAN_MOTION": "9" * 400},
+        {"MEAN_ELEMENT_THEORY": "SGP4-XP"}, {"EPHEMERIS_TYPE": 4},
     ],
 )  # fmt: skip
 def test_one_bad_message_is_told_and_the_others_are_read(bad, tmp_path):
@@ -63,6 +95,47 @@ def test_one_bad_message_is_told_and_the_others_are_read(bad, tmp_path):
     known = read_known_objects(write(tmp_path / "a.json", text))
     assert [each.number for each in known.sets] == [25544]
     assert [fault.where for fault in known.faults] == ["message 1", "message 3"]
+
+
+@pytest.mark.parametrize("theory", ["SGP4", "SGP", "SGP/SGP4"])
+def test_elements_for_sgp4_are_read(theory, tmp_path):
+    text = json.dumps([omm(MEAN_ELEMENT_THEORY=theory)])
+    assert len(read_known_objects(write(tmp_path / "a.json", text)).sets) == 1
+
+
+def segment(left_out=None):
+    """Return a segment of an OMM in XML, without one of its parts."""
+    fields = omm()
+    parts = {
+        "metadata": ("OBJECT_NAME", "OBJECT_ID", "CENTER_NAME", "MEAN_ELEMENT_THEORY"),
+        "meanElements": (
+            "EPOCH", "MEAN_MOTION", "ECCENTRICITY", "INCLINATION", "RA_OF_ASC_NODE",
+            "ARG_OF_PERICENTER", "MEAN_ANOMALY",
+        ),
+        "tleParameters": ("NORAD_CAT_ID", "BSTAR", "MEAN_MOTION_DOT", "MEAN_MOTION_DDOT"),
+    }  # fmt: skip
+    metadata, elements, parameters = (
+        "" if part == left_out
+        else f"<{part}>{''.join(f'<{n}>{fields[n]}</{n}>' for n in names)}</{part}>"
+        for part, names in parts.items()
+    )  # fmt: skip
+    return f"<segment>{metadata}<data>{elements}{parameters}</data></segment>"
+
+
+@pytest.mark.parametrize(
+    ("left_out", "what"),
+    [
+        ("tleParameters", "message 2: not an OMM: NORAD_CAT_ID is missing"),
+        ("meanElements", "message 2: not an OMM: EPOCH is missing"),
+        ("data", "message 2: not an OMM: NORAD_CAT_ID is missing"),
+    ],
+)
+def test_one_bad_segment_is_told_and_the_others_are_read(left_out, what, tmp_path):
+    bad = "<segment/>" if left_out == "data" else segment(left_out)
+    text = f"<ndm><omm><body>{segment()}{bad}</body></omm><omm>{segment('metadata')}</omm></ndm>"
+    known = read_known_objects(write(tmp_path / "a.xml", text))
+    assert [(s.name, s.number) for s in known.sets] == [("ISS (ZARYA)", 25544), ("", 25544)]
+    assert [str(fault) for fault in known.faults] == [what]
 
 
 def test_what_the_orbit_does_not_need_may_be_anything(tmp_path):
