@@ -181,6 +181,7 @@ def orbit_arc(
 # Objects without an orbit: each state, moved through the arc that it was fitted to.
 
 HALF_ARC_S = 300.0  # a state is of an arc of ten minutes at most
+LEAST_HALF_ARC_S = 1.0
 
 
 def single_states(states: pl.DataFrame) -> list[Ephemeris]:
@@ -197,18 +198,27 @@ def single_states(states: pl.DataFrame) -> list[Ephemeris]:
 def arcs(states: pl.DataFrame, positions: pl.DataFrame) -> list[Ephemeris]:
     """Return an ephemeris for each of the STATES of one object, in order of time.
 
-    It covers the object's POSITIONS about the state's epoch: point mass and J2 from there, with the
-    covariance of each state.
+    It covers those of the object's POSITIONS that are nearest to the state's epoch, so that no two
+    overlap: point mass and J2 from there, with the covariance of each state.
     """
+    singles = single_states(states.unique("epoch", keep="first").sort("epoch"))
+    epoch_ns = np.array([int(of.time_ns[0]) for of in singles], np.int64)
     seen_ns = positions["epoch"].dt.epoch("ns").to_numpy()
-    return [_arc(state, seen_ns) for state in single_states(states.sort("epoch"))]
+    nearest = np.searchsorted((epoch_ns[:-1] + epoch_ns[1:]) // 2, seen_ns)
+    half_s = np.diff(epoch_ns) / SECOND_NS / 2  # to the middle between two states
+    room_s = np.minimum(np.concatenate([[np.inf], half_s, [np.inf]]), LEAST_HALF_ARC_S)
+    return [
+        _arc(of, seen_ns[nearest == k], (-room_s[k], room_s[k + 1])) for k, of in enumerate(singles)
+    ]
 
 
-def _arc(of: Ephemeris, seen_ns: np.ndarray) -> Ephemeris:
+def _arc(of: Ephemeris, seen_ns: np.ndarray, least_s: tuple[float, float]) -> Ephemeris:
+    """Return a state moved to the first and the last of these times, or to `least_s` about it."""
     epoch_ns = int(of.time_ns[0])
     since_s = (seen_ns - epoch_ns) / SECOND_NS
     inside = since_s[np.abs(since_s) <= HALF_ARC_S]
-    first, last = min(inside.min(initial=0.0), -1.0), max(inside.max(initial=0.0), 1.0)
+    first = min(inside.min(initial=0.0), least_s[0])
+    last = max(inside.max(initial=0.0), least_s[1])
     step = (last - first) / STEPS
     later = np.linspace(0.0, last, int(np.ceil(last / step)) + 1)
     earlier = np.linspace(0.0, first, int(np.ceil(-first / step)) + 1)

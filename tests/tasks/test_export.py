@@ -64,6 +64,39 @@ def test_positions_move_by_the_velocity_and_their_covariance_by_its_error():
     assert grown == pytest.approx(0.5**2 + (0.01 * dt) ** 2, rel=0.01)
 
 
+def following(states, *since_s):
+    """Return the state again at these seconds after it."""
+    return pl.concat([
+        states.with_columns(pl.col("epoch") + pl.duration(milliseconds=round(s * 1000)))
+        for s in since_s
+    ])  # fmt: skip
+
+
+def test_each_position_is_covered_by_the_state_with_the_nearest_epoch():
+    since_s = np.arange(-30.0, 91.0, 7.5)
+    states, places = tables(*since_s)
+    found = arcs(following(states, 60.0, 0.0), places)
+    epoch_ns = states["epoch"].dt.epoch("ns")[0]
+    spans = [[(t - epoch_ns) / 1e9 for t in arc.time_ns[[0, -1]]] for arc in found]
+    assert spans == [[-30.0, 30.0], [37.5, 90.0]]
+
+
+def test_a_state_covers_no_arc_that_has_none_beyond_five_minutes():
+    states, places = tables(-5.0, 5.0, 200.0, HALF_ARC_S + 5.0)
+    (arc, later) = arcs(following(states, 0.0, 800.0), places)
+    epoch_ns = states["epoch"].dt.epoch("ns")[0]
+    assert [(t - epoch_ns) / 1e9 for t in arc.time_ns[[0, -1]]] == [-5.0, 200.0]
+    assert [(t - epoch_ns) / 1e9 for t in later.time_ns[[0, -1]]] == [799.0, 801.0]
+
+
+def test_states_within_two_seconds_do_not_overlap():
+    states, places = tables(0.0)
+    before, after = arcs(following(states, 0.0, 0.0, 0.8), places)
+    epoch_ns = states["epoch"].dt.epoch("ns")[0]
+    assert [(t - epoch_ns) / 1e9 for t in before.time_ns[[0, -1]]] == pytest.approx([-1.0, 0.4])
+    assert [(t - epoch_ns) / 1e9 for t in after.time_ns[[0, -1]]] == pytest.approx([0.4, 1.8])
+
+
 def test_a_state_without_positions_is_two_seconds_long():
     (arc,) = arcs(*tables())
     assert arc.time_ns[-1] - arc.time_ns[0] == 2e9
