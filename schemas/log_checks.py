@@ -444,7 +444,7 @@ class LogCause(StrEnum):
         "no_calibration",
         CheckVerdict.WRONG,
         "{frames:,.0f} frames and no valid calibration: the sensor takes no part",
-        "add the log that has it, or write the calibration that `epipole calibrate` finds",
+        "also name the log that has it, or write the calibration that `epipole calibrate` finds",
     )
     IMPOSSIBLE_CENTROID_SIGMA = (
         "impossible_centroid_sigma",

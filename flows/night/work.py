@@ -146,7 +146,10 @@ def _why_not(rejects: pa.Table) -> str:
     sentences = [f"{reason}: {reason.sentence}" for reason in invalid]
     if sentences:
         return "those in the log are invalid: " + " ".join(sentences)
-    return "record foxglove.CameraCalibration with the sensor's id as frame_id"
+    return (
+        "name the log that has it too: of a folder, a run of one night reads only the logs of that "
+        "night; or record foxglove.CameraCalibration with the sensor's id as frame_id"
+    )
 
 
 def spans_of_night(spans: Sequence[Span], night: str) -> list[Span]:

@@ -68,7 +68,10 @@ def test_a_sensor_whose_velocities_are_wrong_is_used_without_them(monkeypatch):
 
 
 def test_no_calibration_at_all_is_an_error_that_says_what_to_do():
-    with pytest.raises(LogError, match=r"no sensor has a calibration \(a\).*frame_id"):
+    says = (
+        r"no sensor has a calibration \(a\).*name the log that has it.*only the logs of .*frame_id"
+    )
+    with pytest.raises(LogError, match=says):
         plan_spans(frames([], a=[1.0]), NIGHT)
 
 
