@@ -30,7 +30,7 @@ def prune(
     Nights go with their reports and the records of their runs. A night on which a run
     works stays. The night after the last one removed is stale from then on.
     """
-    from epipole.io.datasets.dataset import remove, require_dataset, sizes
+    from epipole.io.datasets.dataset import locked_nights, remove, require_dataset, sizes
     from epipole.io.work.folder import clear_unfinished, unfinished_work
 
     check_night(nights, "--nights")
@@ -38,10 +38,13 @@ def prune(
     if nights is None and reports is None and not work:
         raise typer.BadParameter("say what: --nights DATE, --reports DATE or --work")
     require_dataset(dataset)
+    found = sizes(dataset)
+    locked = locked_nights(dataset) if nights is not None else set()
+    stay = sorted({date for date in map(_date, found) if date in locked and date < (nights or "")})
     chosen = {
         name: size
-        for name, size in sizes(dataset).items()
-        if (nights is not None and _date(name) < nights)
+        for name, size in found.items()
+        if (nights is not None and _date(name) < nights and _date(name) not in stay)
         or (reports is not None and name.startswith("reports/") and _date(name) < reports)
     }
     look = clear_unfinished if yes else unfinished_work
@@ -50,8 +53,9 @@ def prune(
         remove(dataset, list(chosen))
     of_work = {f"work of {each.night}": each.size for each in left}
     if as_json:
-        print_json({"removed": yes, "bytes": {**chosen, **of_work}})
+        print_json({"removed": yes, "bytes": {**chosen, **of_work}, "locked": stay})
         return
+    print_lines(f"night={date} stays: a run works on it" for date in stay)
     print_lines(
         f"{size / 2**20:>10,.1f} MiB  {name}" for name, size in {**chosen, **of_work}.items()
     )

@@ -1,5 +1,6 @@
 """`epipole prune`: what it shows, and what it removes when asked to."""
 
+import json
 import shutil
 
 import pytest
@@ -53,9 +54,24 @@ def test_reports_alone(dataset):
     assert list((dataset / "reports").iterdir()) == []
 
 
-def test_a_night_on_which_a_run_works_stays(dataset):
+def test_a_night_on_which_a_run_works_stays_and_the_others_go(dataset):
+    with lock_nights(str(dataset), [NEXT]):
+        said = prune(dataset, "--nights", "2020-01-01", "--yes")
+        told = json.loads(prune(dataset, "--nights", "2020-01-01", "--json"))
+    assert f"night={NEXT} stays: a run works on it\n" in said
+    assert f"night={NIGHT}\n" in said
+    assert told == {"removed": False, "bytes": {}, "locked": [NEXT]}
+    assert nights_in(str(dataset)) == [NEXT]
+    left = {str(f.relative_to(dataset)) for f in dataset.glob("r*/*.*")}
+    assert left >= {f"reports/{NEXT}.html", f"runs/{NEXT}.parquet"}
+    assert not any(NIGHT in name for name in left)
+
+
+def test_a_night_that_is_locked_meanwhile_is_not_removed(dataset, monkeypatch):
+    monkeypatch.setattr("epipole.io.datasets.dataset.locked_nights", lambda _: set())
     with lock_nights(str(dataset), [NIGHT]):
-        prune(dataset, "--nights", NEXT, "--yes", code=1)
+        said = prune(dataset, "--nights", NEXT, "--yes", code=1)
+    assert "has worked on it since" in said
     assert nights_in(str(dataset)) == [NIGHT, NEXT]
 
 
