@@ -156,9 +156,10 @@ def nearest_frame(epoch_ns: Nanoseconds, time_ns: Nanoseconds) -> Integers:
 
 # Order and duplicates
 
-# Share of a sensor's frames at which its counter may restart. Two sensors with one id seem to
-# restart at each second frame.
-MAX_RESTARTS = 0.1
+# Share of a sensor's frames at which its counter may restart, unless no more than this share of the
+# restarts begin higher than the one before: bursts may be numbered from 0. Two sensors with one id
+# seem to restart at each second frame, and ever higher.
+MAX_RESTARTS, MAX_HIGHER = 0.1, 0.25
 LARGEST_NUMBER = 2**62  # with a restart after it, sums might not fit in 64 bits
 
 
@@ -166,8 +167,9 @@ def restart_shifts(time_ns: Integers, frame_number: Integers) -> Integers:
     """Return what to add to the frame numbers of a sensor so that none comes again, (n,).
 
     A counter restarts with its sensor, or begins again at its end. Then the numbers go on from the
-    highest one before. It has restarted where the number falls to one that was used since the last
-    restart, and counts up from there: a single wrong number does not count.
+    highest one before. It has restarted where the number falls, counts up from there, and numbers
+    that were used since the last restart come again: the one it falls to, or those of two frames in
+    succession before the next fall. A single wrong number does not count.
 
     Parameters
     ----------
@@ -179,24 +181,37 @@ def restart_shifts(time_ns: Integers, frame_number: Integers) -> Integers:
     first = np.ones(len(f), np.bool_)
     first[1:] = (t[1:] != t[:-1]) | (f[1:] != f[:-1])
     number = f[first]
-    falls = np.flatnonzero(number[1:-1] < number[:-2]) + 1
-    falls = falls[(number[falls + 1] > number[falls]) & (number[falls + 1] <= number[falls - 1])]
+    falls = _falls(number)
+    ends = np.append(falls[1:], len(number)).tolist()
     starts, shifts = [0], [0]
-    if len(falls) <= max(1, MAX_RESTARTS * len(number)):
-        used = _used_before(number)
-        for fall in falls.tolist():
-            if used[fall] < starts[-1]:
-                continue
-            highest = int(number[starts[-1] : fall].max()) + shifts[-1]
-            if highest > LARGEST_NUMBER:
-                break
-            starts.append(fall)
-            shifts.append(highest + 1 - int(number[fall]))
+    used = _used_before(number)
+    for fall, end in zip(falls.tolist(), ends, strict=False):
+        again = (used[fall:end] >= starts[-1]) & (used[fall:end] < fall)
+        if not again[0] and not (again[1:] & again[:-1]).any():
+            continue
+        highest = int(number[starts[-1] : fall].max()) + shifts[-1]
+        if highest > LARGEST_NUMBER:
+            break
+        starts.append(fall)
+        shifts.append(highest + 1 - int(number[fall]))
     of_number = np.repeat(shifts, np.diff(starts, append=len(number)))
     of_number[number > LARGEST_NUMBER] = 0  # with a shift it would not fit
     out = np.zeros(len(f), np.int64)
     out[order] = of_number[np.cumsum(first) - 1]
     return out
+
+
+def _falls(number: Integers) -> Integers:
+    """Return where the number falls and counts up from there; none if the numbers are of two
+    sensors."""
+    falls = np.flatnonzero(number[1:-1] < number[:-2]) + 1
+    falls = falls[(number[falls + 1] > number[falls]) & (number[falls + 1] <= number[falls - 1])]
+    higher = np.count_nonzero(np.diff(number[falls]) > 0)
+    many = len(falls) > max(1, MAX_RESTARTS * len(number))
+    if many and higher > MAX_HIGHER * len(falls):
+        return falls[:0]
+    # After a single wrong number, the count goes on as before it.
+    return falls[(falls < 2) | (number[falls] <= number[falls - 2])]
 
 
 def _used_before(number: Integers) -> Integers:

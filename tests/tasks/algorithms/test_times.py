@@ -218,7 +218,13 @@ def test_states_of_one_time_count_once_and_the_first_given_is_kept():
         ([], []),
         ([5], [0]),
         ([0, 1, 2, 0, 1, 2, 3], [0, 0, 0, 3, 3, 3, 3]),  # a restart
-        ([6, 7, 0, 1, 2, 6, 7, 8], [0] * 5 + [0] * 3),  # lower numbers, used later
+        (
+            [6, 7, 0, 1, 2, 6, 7, 8],
+            [0, 0, 8, 8, 8, 8, 8, 8],
+        ),  # a restart: lower numbers, used later
+        ([6, 7, 8, 1, 2, 3, 4, 5], [0] * 8),  # lower numbers that never come again
+        ([6, 7, 8, 1, 2, 3, 7, 9], [0] * 8),  # and one that does
+        ([0, 1, 2, 6, 7, 8, 3, 4, 5, 9], [0] * 10),  # out of order
         ([0, 1, 2, 3, 1, 5, 6], [0] * 7),  # one wrong number
         ([0, 1, 2, 9, 3, 4, 5], [0] * 7),  # one wrong number, no other comes again
         ([0, 0, 1, 1, 2, 2, 3, 3], [0] * 8),  # two sensors with one id
@@ -239,6 +245,35 @@ def test_a_counter_of_eight_bits_never_gives_a_number_twice():
     number[2500:] = np.arange(2500) % 256  # restarted once more
     numbered = number + restart_shifts(np.arange(5000), number)
     assert (np.diff(numbered) == 1).all()
+
+
+@pytest.mark.parametrize("first", [0, 3, 200, 254])
+def test_a_counter_that_begins_anywhere_never_gives_a_number_twice(first):
+    number = (np.arange(5000) + first) % 256
+    numbered = number + restart_shifts(np.arange(5000), number)
+    assert (np.diff(numbered) > 0).all()
+
+
+def test_wrong_numbers_do_not_hide_that_a_counter_began_again():
+    number = (np.arange(5000) + 200) % 1024
+    number[[900, 950, 3000]] = [9999, 5, 8888]
+    numbered = number + restart_shifts(np.arange(5000), number)
+    sound = np.delete(np.arange(5000), [900, 950, 3000])
+    assert (np.diff(numbered[sound]) > 0).all()
+
+
+@pytest.mark.parametrize("n_frames", [2, 3, 5, 9, 12])
+def test_short_bursts_that_count_from_zero_give_no_number_twice(n_frames):
+    number = np.arange(6000) % n_frames
+    numbered = number + restart_shifts(np.arange(6000), number)
+    assert (np.diff(numbered) == 1).all()
+
+
+def test_bursts_of_which_frames_are_missing_give_no_number_twice():
+    there = np.random.default_rng(3).random(6000) < 0.9
+    number = (np.arange(6000) % 12)[there]
+    numbered = number + restart_shifts(np.arange(len(number)), number)
+    assert (np.diff(numbered) > 0).all()
 
 
 def test_the_largest_number_after_a_restart_stays_as_it_is():

@@ -130,6 +130,13 @@ def test_after_a_restart_of_the_counter_numbers_go_on(tmp_path):
     assert array(log.rejects, "time").tolist() == [START_NS + 10 * SECOND_NS]
 
 
+def test_a_counter_that_was_first_recorded_later_may_restart_below_that(tmp_path):
+    run = [*range(3, 50), *range(60)]
+    log = read(write(tmp_path / "a.mcap", "s", list(enumerate(run))))
+    assert array(log.exposures, "frame_number").tolist() == [*range(3, 50), *range(50, 110)]
+    assert rows(log) == [("restarted_counter", "s", "a.mcap", 60)]
+
+
 def test_logs_that_each_count_from_zero_are_one_sensor(tmp_path):
     a = write(tmp_path / "a.mcap", "s", [(i, i) for i in range(5)])
     b = write(tmp_path / "b.mcap", "s", [(i + 5, i) for i in range(5)])
