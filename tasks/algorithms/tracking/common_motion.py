@@ -37,7 +37,7 @@ class CommonMotion(NamedTuple):
 def common_motion(
     time_s: Array, offsets: Indices, u_icrs: Array, sigma_rad: Array, track: Indices
 ) -> CommonMotion | None:
-    """Return the common motion of tracks; None where they have none, or where it is not needed.
+    """Return the common motion of tracks; None where they show none, or it is not needed.
 
     It is needed where the acceleration that a rate allows exceeds the error of a detection between
     two frames.
@@ -77,8 +77,10 @@ def common_motion(
     good = np.isfinite(bends[:, 0])
     if good.sum() < max(MIN_SHOWN * (len(time_s) - 2), 1):
         return None
-    bends = _smoothed(time_s, bends, good)
     begin = next_to & (frame[one] < frame[one].min() + BEGIN_FRAMES)
+    if not begin.any():  # the first frames are too far apart to tell the rate there
+        return None
+    bends = _smoothed(time_s, bends, good)
     start, _ = _robust_mean(w[begin], u_icrs[one[begin]])
     return CommonMotion(_rotations(time_s, u_icrs[rows].mean(axis=0), start, bends), rate)
 

@@ -50,3 +50,25 @@ def test_without_tracks_there_is_no_common_motion():
     t, offsets, u, who = ring(3)
     assert common_motion(t, offsets, u, np.full(len(u), SIGMA), np.full(len(u), -1)) is None
     assert common_motion(t, offsets, u, np.full(len(u), SIGMA), np.where(who < 2, who, -1)) is None
+
+
+def without_frames(blank, seed=0, n_frames=12):
+    """Return times, offsets and directions of a ring, without detections in some frames."""
+    t, offsets, u, _ = ring(seed, n_frames=n_frames)
+    frame = np.repeat(np.arange(n_frames), np.diff(offsets))
+    kept = ~np.isin(frame, blank)
+    return t, np.searchsorted(frame[kept], np.arange(n_frames + 1)), u[kept]
+
+
+def test_without_detections_in_successive_frames_at_the_beginning_there_is_no_common_motion():
+    t, offsets, u = without_frames([1, 2, 3])
+    track = follow(t, offsets, u)
+    assert common_motion(t, offsets, u, np.full(len(u), SIGMA), track) is None
+    assert (track >= 0).mean() > 0.9
+
+
+@pytest.mark.parametrize("blank", [[0, 1, 2], [1], [2], [1, 3], [1, 2, 3, 4]])
+def test_wherever_frames_are_empty_the_common_motion_is_finite_or_none(blank):
+    t, offsets, u = without_frames(blank)
+    motion = common_motion(t, offsets, u, np.full(len(u), SIGMA), follow(t, offsets, u))
+    assert motion is None or np.isfinite(motion.rotation).all()
