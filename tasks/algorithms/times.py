@@ -13,6 +13,9 @@ UNIX_EPOCH_JD = 2440587.5
 NODE_NS = 600_000_000_000
 TT_MINUS_TAI_S = 32.184
 MILLISECOND_NS = 1_000_000
+# The rate of frames may change in a night. An even number: of pairs of exposures, half the
+# intervals are short, and the median is half the time between the pairs.
+NEAR_INTERVALS = 20
 KEEP, DUPLICATE_FRAME, DUPLICATE_NUMBER, DUPLICATE_TIME = range(4)
 
 
@@ -97,6 +100,26 @@ def frame_interval_ns(time_ns: Nanoseconds) -> int:
     """Return the usual interval between a sensor's frames [ns]; 0 with fewer than two."""
     steps = np.diff(np.unique(time_ns))
     return int(np.median(steps)) if len(steps) else 0
+
+
+def frame_intervals_ns(time_ns: Nanoseconds) -> Nanoseconds:
+    """Return the usual interval between a sensor's frames about each of them [ns], (n,).
+
+    It is the median of the `NEAR_INTERVALS` nearest to the frame, or that of all where they are
+    longer: frames may be faster for a while. 0 with fewer than two.
+
+    Parameters
+    ----------
+    time_ns : (n,) int
+        Frame times [ns], increasing.
+    """
+    steps, usual = np.diff(time_ns), frame_interval_ns(time_ns)
+    out = np.full(len(time_ns), usual, np.int64)
+    if len(steps) <= NEAR_INTERVALS:
+        return out
+    near = np.median(np.lib.stride_tricks.sliding_window_view(steps, NEAR_INTERVALS), axis=1)
+    first = np.arange(len(time_ns)) - NEAR_INTERVALS // 2
+    return np.asarray(np.maximum(out, near[np.clip(first, 0, len(near) - 1)].astype(np.int64)))
 
 
 def epoch_interval_ns(time_ns_by_sensor: list[Nanoseconds]) -> int:

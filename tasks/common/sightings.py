@@ -23,7 +23,7 @@ from epipole.tasks.algorithms.geometry.covariances import (
     in_components,
 )
 from epipole.tasks.algorithms.geometry.directions import matrix_from_quaternion, unit_from_radec
-from epipole.tasks.algorithms.times import frame_interval_ns
+from epipole.tasks.algorithms.times import frame_intervals_ns
 
 # Sightings of tracklets.
 
@@ -199,12 +199,17 @@ def optics_covariance_of(cameras: pa.Table, row: int) -> Array:
 MARK = "lone:"  # sensor ids have no colon, so no other id begins like this
 
 
+def max_coast(interval: Array | Integers, settings: TrackletSettings) -> Array:
+    """Return the maximum time between two frames of a track, for usual intervals of frames."""
+    return np.asarray((settings.max_missed + 1.5) * interval)  # half a frame of slack, for jitter
+
+
 def in_lone_frames(frame_time_ns: Integers, settings: TrackletSettings) -> Flags:
     """Return which frames of one sensor, in time order, have too few others near for a tracklet."""
     if not len(frame_time_ns):
         return np.zeros(0, bool)
-    coast_ns = (settings.max_missed + 1.5) * frame_interval_ns(frame_time_ns)
-    run = np.concatenate([[0], np.cumsum(np.diff(frame_time_ns) > coast_ns)]).astype(np.int64)
+    coast_ns = max_coast(frame_intervals_ns(frame_time_ns), settings)
+    run = np.concatenate([[0], np.cumsum(np.diff(frame_time_ns) > coast_ns[1:])]).astype(np.int64)
     return np.asarray(np.bincount(run)[run] < settings.min_detections)
 
 

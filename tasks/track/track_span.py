@@ -33,7 +33,7 @@ from epipole.tasks.algorithms.constants import ARCSEC
 from epipole.tasks.algorithms.geometry.camera import Camera
 from epipole.tasks.algorithms.geometry.covariances import traces
 from epipole.tasks.algorithms.geometry.directions import lengths
-from epipole.tasks.algorithms.times import frame_interval_ns
+from epipole.tasks.algorithms.times import frame_interval_ns, frame_intervals_ns
 from epipole.tasks.algorithms.tracking.hot_pixels import CERTAIN, LIKELY, NOWHERE
 from epipole.tasks.algorithms.tracking.linking.chains import (
     Fragments,
@@ -50,6 +50,7 @@ from epipole.tasks.common.sightings import (
     camera_of,
     cameras_of,
     image_sightings_of,
+    max_coast,
     part_of,
     sightings_of,
     solved_frames,
@@ -210,6 +211,7 @@ class _TrackedFrames(NamedTuple):
     camera: Camera  # of the first frame
     cameras: pa.Table  # of all
     interval_s: float
+    intervals_s: Array  # about each frame
     on_sky: bool
 
 
@@ -220,23 +222,30 @@ def _parts(
     frames = solved_frames(solutions)
     if len(frames.number):
         camera = camera_of(cameras, int(frames.camera[0]))
-        interval_s = frame_interval_ns(frames.time_ns) / 1e9
+        intervals_s = _intervals_s(frames.time_ns, frames)
         seen = sightings_of(frames, detections, cameras)
-        yield _TrackedFrames(frames, seen, camera, cameras, interval_s, True)
+        yield _TrackedFrames(frames, seen, camera, cameras, *intervals_s, True)
     unsolved = unsolved_frames(solutions)
     if len(unsolved.number):
         camera = camera_of(cameras, int(unsolved.camera[0]))
-        # The interval of all frames: frames without an attitude may be far apart.
-        interval_s = frame_interval_ns(np.sort(array(solutions, "time"))) / 1e9
+        # The intervals of all frames: frames without an attitude may be far apart.
+        intervals_s = _intervals_s(np.sort(array(solutions, "time")), unsolved)
         sightings = image_sightings_of(unsolved, detections, camera)
-        yield _TrackedFrames(unsolved, sightings, camera, cameras, interval_s, False)
+        yield _TrackedFrames(unsolved, sightings, camera, cameras, *intervals_s, False)
+
+
+def _intervals_s(time_ns: Integers, frames: Frames) -> tuple[float, Array]:
+    """Return the usual interval of frames at some times, and that about each of `frames`, which are
+    among these [s]."""
+    about = frame_intervals_ns(time_ns)[np.searchsorted(time_ns, frames.time_ns)]
+    return frame_interval_ns(time_ns) / 1e9, about / 1e9
 
 
 def _follow(
     part: _TrackedFrames, sightings: Sightings, detections: pa.Table, settings: TrackletSettings
 ) -> Integers:
     """Return the track number of each sighting; NONE where it belongs to no track."""
-    frames, camera, interval_s = part.frames, part.camera, part.interval_s
+    frames, camera = part.frames, part.camera
     seen = SkyDetections(
         (frames.time_ns - frames.time_ns[0]) / 1e9,
         sightings.offsets,
@@ -247,8 +256,7 @@ def _follow(
     return follow_detections(
         seen,
         max_rate_rad_s=np.radians(settings.max_rate_deg_s),
-        # Half a frame of slack, for jitter.
-        max_coast_s=(settings.max_missed + 1.5) * interval_s,
+        max_coast_s=max_coast(part.intervals_s, settings),
         max_missed=settings.max_missed,
         min_detections=settings.min_detections,
         gate_sigma=settings.gate_sigma,

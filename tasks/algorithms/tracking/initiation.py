@@ -101,7 +101,7 @@ class TrackRule(NamedTuple):
     """When a track begins and ends.
 
     max_rate : maximum rate [rad/s]
-    max_coast : maximum time between two frames of a track [s]
+    max_coast : (f,) float, maximum time between each frame and an earlier one of a track [s]
     max_missed : maximum number of successive frames without a detection
     min_detections : minimum number of detections of a new track
     gate2 : maximum chi-square at which a detection continues a track
@@ -111,7 +111,7 @@ class TrackRule(NamedTuple):
     """
 
     max_rate: float
-    max_coast: float
+    max_coast: Array
     max_missed: int
     min_detections: int
     gate2: float
@@ -530,7 +530,7 @@ def _strongest_chains(f, depth, detections, recent, rule):
     variance = recent.smallest.min()
     for g in range(f - 1, max(f - 1 - (FAINT_APART if faint else APART), -1), -1):
         dt = times[f] - times[g]
-        if dt <= 0.0 or dt > rule.max_coast or g == 0 or n == 0:
+        if dt <= 0.0 or dt > rule.max_coast[f] or g == 0 or n == 0:
             continue
         pairs_sr = density[0] * density[f - g] * field_sr
         wanted = np.log(pairs_sr * field_sr) + rule.min_evidence

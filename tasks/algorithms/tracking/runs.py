@@ -128,7 +128,7 @@ def follow_detections(
     seen: SkyDetections,
     *,
     max_rate_rad_s: float,
-    max_coast_s: float,
+    max_coast_s: float | Array,
     max_missed: int,
     min_detections: int,
     gate_sigma: float,
@@ -140,8 +140,10 @@ def follow_detections(
 
     Parameters
     ----------
-    max_rate_rad_s, max_coast_s
-        Maximum rate of an object, and maximum time between two frames of a track.
+    max_rate_rad_s
+        Maximum rate of an object.
+    max_coast_s : float or (f,) float
+        Maximum time between each frame and an earlier one of the same track.
     max_missed
         Number of successive misses after which a track ends, unless its motion is known so well
         that a false detection in its gate is improbable (`MAX_STRAYS`).
@@ -169,7 +171,7 @@ def follow_detections(
     max_per_frame = max(MAX_PAIRS_OF_ALL / max(len(seen.time_s), 1), MIN_PAIRS)
     rule = TrackRule(
         float(max_rate_rad_s),
-        float(max_coast_s),
+        np.array(np.broadcast_to(max_coast_s, len(seen.time_s)), float),
         int(max_missed),
         int(max(min_detections, 2)),
         float(gate_sigma) ** 2,
@@ -268,7 +270,8 @@ def _follow(detections, max_in_frame, rule):
         missed = tracks.missed[live]
         is_sure = (missed <= MAX_MISSED_FRAMES) & (tracks.strays[live] <= MAX_STRAYS)
         live = live[
-            ((missed <= rule.max_missed) | is_sure) & (times[f] - tracks.at[live] <= rule.max_coast)
+            ((missed <= rule.max_missed) | is_sure)
+            & (times[f] - tracks.at[live] <= rule.max_coast[f])
         ]
         contested |= _assign(f, live, tracks, detections, recent, rule)
         began, length, chains = new_tracks(

@@ -21,6 +21,7 @@ from epipole.tasks.algorithms.times import (
     epoch_grid,
     epoch_interval_ns,
     frame_interval_ns,
+    frame_intervals_ns,
     julian_year,
     nearest_frame,
     order_frames,
@@ -204,6 +205,33 @@ def test_kept_frames_are_unique_and_do_not_depend_on_the_order_given(frames, ran
     assert kept == sorted(kept)
     assert len({(s, t) for s, t, _ in kept}) == len(kept) == len({(s, n) for s, _, n in kept})
     assert {s for s, *_ in kept} == {s for s, *_ in frames}
+
+
+def test_the_interval_about_each_frame_is_that_of_its_rate_of_frames():
+    slow, fast = SECOND * np.arange(100), SECOND * 100 + SECOND // 5 * np.arange(1000)
+    about = frame_intervals_ns(np.concatenate([slow, fast]))
+    assert (about[:91] == SECOND).all()
+    assert (about[111:] == SECOND // 5).all()
+    assert (np.diff(about) <= 0).all()
+
+
+def test_the_interval_about_each_frame_is_the_usual_one_where_that_is_longer():
+    slow, fast = SECOND * np.arange(1000), SECOND * 1000 + SECOND // 5 * np.arange(100)
+    assert (frame_intervals_ns(np.concatenate([slow, fast])) == SECOND).all()
+
+
+@pytest.mark.parametrize("n", [0, 1, 2, 5, 21, 22, 300])
+def test_the_interval_about_each_frame_of_an_even_series_is_that_of_the_series(n):
+    assert frame_intervals_ns(SECOND * np.arange(n)).tolist() == [SECOND * (n > 1)] * n
+    with_gaps = SECOND * (np.arange(n) + 50 * (np.arange(n) // 30))
+    assert frame_intervals_ns(with_gaps).tolist() == [SECOND * (n > 1)] * n
+
+
+@pytest.mark.parametrize("n", [100, 101])
+def test_the_interval_about_each_of_many_pairs_of_exposures_is_half_that_of_the_pairs(n):
+    pairs = SECOND * 2 * np.arange(n)[:, None] + np.array([0, SECOND // 10])
+    for time_ns in (pairs.ravel(), pairs.ravel()[:-1]):
+        assert set(frame_intervals_ns(time_ns).tolist()) == {SECOND}
 
 
 def test_states_of_one_time_count_once_and_the_first_given_is_kept():

@@ -27,6 +27,13 @@ def test_a_frame_hours_from_the_others_stands_alone():
     assert lone(0, 1, 2, 3, 7200) == [False] * 4 + [True]
 
 
+def test_where_the_rate_of_frames_changes_none_stands_alone():
+    slow, fast = np.arange(100), np.arange(100, 200, 0.1)
+    assert not in_lone_frames(
+        np.round(np.concatenate([slow, fast]) * SECOND).astype(np.int64), TrackletSettings()
+    ).any()
+
+
 def test_ids_of_lone_detections_are_not_published():
     ids = pa.chunked_array([pa.array(["sat1-3-4", f"{MARK}sat1-5-6"])])
     assert published_ids(ids).to_pylist() == ["sat1-3-4", None]

@@ -9,7 +9,7 @@ from scenes.identified import identified, tracked
 from scipy.spatial.transform import Rotation
 
 from epipole.flows.command_line.log_info import of_sensor
-from epipole.schemas.bridge import table
+from epipole.schemas.bridge import array, table
 from epipole.schemas.columns import TIME
 from epipole.schemas.given_settings import validate_settings
 from epipole.schemas.settings import Settings
@@ -292,6 +292,46 @@ def kinds(rate_arcsec_s):
 )
 def test_a_slow_drift_is_a_stars_and_a_faster_one_an_objects(rate_arcsec_s, kind):
     assert kinds(rate_arcsec_s).count(kind) > 0.98 * N
+
+
+def crossing(time_s, source="stars"):
+    """Return the tracklets of a point that crosses the image in each 40 s, seen at these times."""
+    n, rng = len(time_s), np.random.default_rng(1)
+    at_px = np.array([[100.0], [500.0]]) + np.outer([20.0, 3.0], time_s % 40.0)
+    at_px += rng.normal(0, 0.15, (2, n))
+    ra, dec = radec_from_unit(unproject(Camera(**CAMERA), *at_px))
+    names = {"sensor_id": ["a"] * n, "frame_number": np.arange(n)}
+    names["time"] = np.round(time_s * 1e9).astype(np.int64)
+    detections = filled(
+        DETECTIONS, n, **names, ra_deg=np.degrees(ra), dec_deg=np.degrees(dec),
+        sigma_arcsec=np.full(n, 3.0), kind=["unknown"] * n, x_px=at_px[0], y_px=at_px[1],
+    )  # fmt: skip
+    solutions = filled(
+        SOLUTIONS, n, **names, attitude_source=[source] * n,
+        **{f"q{a}": np.full(n, float(a == "w")) for a in "xyzw"},
+        **{f"cov_att_{ab}_arcsec2": np.full(n, float(ab[0] == ab[1]))
+           for ab in ("xx", "xy", "xz", "yy", "yz", "zz")},
+    )  # fmt: skip
+    return tracked(solutions, detections, cameras_of({"a": Camera(**CAMERA)}), Settings())
+
+
+@pytest.mark.parametrize("source", ["stars", "none"])
+@pytest.mark.parametrize("fast_s", [0.2, 0.05])
+def test_objects_are_followed_where_the_rate_of_frames_changes(fast_s, source):
+    slow, fast = np.arange(300.0), np.arange(300.0, 420.0, fast_s)
+    for time_s in (np.concatenate([slow, fast]), np.concatenate([fast - 300.0, slow + 120.0])):
+        followed = array(crossing(time_s, source).detections, "kind") == "object"
+        is_slow = (time_s < 300.0) if time_s[1] == 1.0 else (time_s >= 120.0)
+        assert followed[is_slow].mean() > 0.98
+        assert followed[~is_slow].mean() > 0.98
+
+
+@pytest.mark.parametrize("n", [150, 149])
+def test_objects_are_followed_through_pairs_of_exposures(n):
+    time_s = np.sort(np.concatenate([np.arange(75) * 2.0, np.arange(75) * 2.0 + 0.1]))[:n]
+    tracklets = crossing(time_s).tracklets
+    assert tracklets.num_rows == 4
+    assert array(tracklets, "n_detections").sum() > 0.98 * n
 
 
 def kinds_under_a_prior(rate_arcsec_s, shaken_arcsec, n=20):

@@ -36,7 +36,7 @@ TIMES = {
 def rule(**changes):
     options = {
         "max_rate": np.radians(2.0),
-        "max_coast": 4.5,
+        "max_coast": np.full(7, 4.5),
         "max_missed": 3,
         "min_detections": 3,
         "gate2": 16.0,
@@ -190,7 +190,7 @@ def by_trying_all(detections, of):
     times, u, f, best = detections.times, detections.directions, len(detections.times) - 1, {}
     for g in range(f - 1, f - 1 - (FAINT_APART if is_sparse(detections, f) else APART), -1):
         dt = times[f] - times[g]
-        if not 0.0 < dt <= of.max_coast:
+        if not 0.0 < dt <= of.max_coast[-1]:
             continue
         ends, starts = free_in(detections, f), free_in(detections, g)
         by_chance = np.log(max(len(ends), 1) * max(len(starts), 1))
