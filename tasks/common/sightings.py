@@ -1,5 +1,6 @@
 """Sightings: detections with the attitude of their frame and the position of its sensor."""
 
+from collections.abc import Iterator
 from typing import NamedTuple
 
 import numpy as np
@@ -186,6 +187,12 @@ def camera_of(cameras: pa.Table, row: int) -> Camera:
     """Return the camera in a row of `cameras`."""
     # Not the time: a Python datetime has no nanoseconds.
     return Camera(**cameras.select(list(Camera._fields)).slice(row, 1).to_pylist()[0])
+
+
+def by_camera(camera: Integers) -> Iterator[tuple[int, Flags]]:
+    """Yield each row of CAMERAS in `camera` (n,), and where it is."""
+    for row in np.unique(camera).tolist():
+        yield row, camera == row
 
 
 def optics_covariance_of(cameras: pa.Table, row: int) -> Array:

@@ -18,7 +18,6 @@ from epipole.schemas.settings import TrackletSettings
 from epipole.schemas.spans import Span
 from epipole.schemas.work_tables import ATTRIBUTABLES, SIGHTINGS
 from epipole.tasks.algorithms.constants import ARCSEC, GM_KM3_S2, SECOND_NS
-from epipole.tasks.algorithms.geometry.camera import Camera
 from epipole.tasks.algorithms.geometry.covariances import (
     attitude_covariance,
     centroid_covariance,
@@ -45,6 +44,7 @@ from epipole.tasks.algorithms.tracking.trails import AlongMotion, along_motion, 
 from epipole.tasks.common.grouping import factorize, group_offsets
 from epipole.tasks.common.sightings import (
     Frames,
+    by_camera,
     camera_of,
     in_lone_frames,
     optics_covariance_of,
@@ -87,15 +87,14 @@ class TrackletSightings(NamedTuple):
 
 
 class SensorSightings(NamedTuple):
-    """The sightings of one sensor, its frames and its optics.
+    """The sightings of one sensor, its frames and its CAMERAS, whose rows `frames` name.
 
     `magnitude` and `magnitude_sigma` (n,) are of the sightings, NaN where unknown.
     """
 
     frames: Frames
     tracklets: TrackletSightings
-    camera: Camera
-    cov_optics: Array
+    cameras: pa.Table
     magnitude: Array
     magnitude_sigma: Array
 
@@ -125,14 +124,11 @@ def sight_objects(
     tracked = detections.filter(has_direction)
     if not tracked.num_rows:
         return None
-    row = int(frames.camera[0])
-    camera = camera_of(cameras, row)
     tracklets = _with_split_prior(_by_tracklet(frames, tracked, cameras), frames, half_width_s)
     tracklets = _with_trails(tracklets, frames)
     tracklets = _with_image_trails(tracklets, frames, half_width_s)
-    tracklets = _with_blends(tracklets, frames, camera)
-    cov_optics = optics_covariance_of(cameras, row)
-    return SensorSightings(frames, tracklets, camera, cov_optics, *_magnitudes(frames, tracklets))
+    tracklets = _with_blends(tracklets, frames, cameras)
+    return SensorSightings(frames, tracklets, cameras, *_magnitudes(frames, tracklets))
 
 
 def _magnitudes(frames: Frames, tracklets: TrackletSightings) -> tuple[Array, Array]:
@@ -166,7 +162,8 @@ def optics_covariance(
 ) -> OpticsCovariances:
     """Return the covariances of directions due to the error of fitted optics.
 
-    They are 0 where the optics are those of the log.
+    They are 0 where the optics are those of the log. Each frame has its camera: a calibration may
+    change.
 
     Parameters
     ----------
@@ -177,17 +174,20 @@ def optics_covariance(
     frame : (n,) int
         Their frames.
     """
-    camera, cov_optics = sightings.camera, sightings.cov_optics
-    if not cov_optics.any():
-        return OpticsCovariances(np.zeros_like(R), np.zeros_like(R))
-    frames = sightings.frames
-    from_stars = frames.from_stars[frame]
-    local = shared_direction_covariance(camera, cov_optics, u_sensor, from_stars)
-    n_stars = np.where(from_stars, np.maximum(array(frames.table, "n_stars")[frame], 1), np.inf)
-    of_attitude = few_stars_covariance(camera, cov_optics) / n_stars[:, None, None]
-    turn = attitude_covariance(u_sensor, of_attitude)
-    back = np.swapaxes(R, 1, 2)
-    return OpticsCovariances(in_components(back, local), in_components(back, turn))
+    frames, out = sightings.frames, OpticsCovariances(np.zeros_like(R), np.zeros_like(R))
+    for row, at in by_camera(frames.camera[frame]):
+        cov_optics = optics_covariance_of(sightings.cameras, row)
+        if not cov_optics.any():
+            continue
+        camera, u = camera_of(sightings.cameras, row), u_sensor[at]
+        from_stars, stars = frames.from_stars[frame[at]], array(frames.table, "n_stars")[frame[at]]
+        local = shared_direction_covariance(camera, cov_optics, u, from_stars)
+        n_stars = np.where(from_stars, np.maximum(stars, 1), np.inf)
+        of_attitude = few_stars_covariance(camera, cov_optics) / n_stars[:, None, None]
+        back = np.swapaxes(R[at], 1, 2)
+        out.local[at] = in_components(back, local)
+        out.turn[at] = in_components(back, attitude_covariance(u, of_attitude))
+    return out
 
 
 def _with_lone(frames: Frames, detections: pa.Table, settings: TrackletSettings) -> pa.Table:
@@ -223,7 +223,9 @@ def _by_tracklet(frames: Frames, tracked: pa.Table, cameras: pa.Table) -> Trackl
     )
 
 
-def _with_blends(tracklets: TrackletSightings, frames: Frames, camera: Camera) -> TrackletSightings:
+def _with_blends(
+    tracklets: TrackletSightings, frames: Frames, cameras: pa.Table
+) -> TrackletSightings:
     """Return the sightings with the errors that the light of neighbours may add.
 
     Sightings that show only a neighbour are left out.
@@ -236,7 +238,10 @@ def _with_blends(tracklets: TrackletSightings, frames: Frames, camera: Camera) -
         tracklets.cov_noise,
         tracklets.flux,
     )
-    variance = blend_variance(tracked, time_s, camera.pixel_rad)
+    pixel_rad = np.empty(len(time_s))
+    for row, at in by_camera(frames.camera):
+        pixel_rad[at] = camera_of(cameras, row).pixel_rad
+    variance = blend_variance(tracked, time_s, pixel_rad)
     cov_bias = tracklets.cov_bias + centroid_covariance(tracklets.u_icrs, np.sqrt(variance))
     of_object = ~of_neighbour(tracked, variance)
     left = np.concatenate([[0], np.cumsum(of_object)])

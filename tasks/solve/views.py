@@ -46,6 +46,8 @@ from epipole.tasks.algorithms.tracking.local_motion import LocalMotion, directio
 from epipole.tasks.common.grouping import group_offsets
 from epipole.tasks.common.sightings import (
     Frames,
+    by_camera,
+    camera_of,
     cameras_of,
     detections_within,
     is_lone,
@@ -130,7 +132,7 @@ def _view_table(
     max_rate_deg_s: float,
     half_width_s: float,
 ) -> pa.Table:
-    frames, tracklets, camera = sightings.frames, sightings.tracklets, sightings.camera
+    frames, tracklets = sightings.frames, sightings.tracklets
     tracklet, row, frame = query
     v = np.nan_to_num(frames.v_gcrf_km_s)
     at_s = (array(epochs, "epoch")[row] - frames.time_ns[0]) / 1e9
@@ -139,23 +141,22 @@ def _view_table(
     frame_s, u, fitted = (frames.time_ns - frames.time_ns[0]) / 1e9, motion.u, motion.fitted
     R = matrix_from_quaternion(interpolate_quaternions(frame_s, frames.q_sensor_from_icrs, at_s))
     u_sensor = np.einsum("nij,nj->ni", R, aberrate(u, v[frame]))
-    x_px, y_px = project(camera, u_sensor)
+    image = _in_images(sightings, frame, u_sensor)
     r_km, v_km_s = states_near_frames(frames, frame, array(epochs, "dt_s")[row])
     cov_noise, cov_bias = (on_tangent_plane(u, c) for c in (motion.cov_noise, motion.cov_bias))
     cov_noise, cov_bias, blend_rad2 = _without_blends(tracklet, cov_noise, cov_bias)
     turn = np.where(frames.from_stars[frame], 0.0, traces(cov_bias))
-    if sightings.cov_optics.any():
-        by_optics = optics_covariance(sightings, R, u_sensor, frame)
+    by_optics = optics_covariance(sightings, R, u_sensor, frame)
+    if by_optics.local.any():
         cov_bias = cov_bias + on_tangent_plane(u, by_optics.whole)
         turn += traces(by_optics.turn)
-    kept = np.isfinite(x_px) & np.isfinite(r_km[:, 0])
+    kept = np.isfinite(image.x_px) & np.isfinite(r_km[:, 0])
     columns = {
         "epoch": array(epochs, "epoch")[row],
         "sensor_id": array(epochs, "sensor_id")[row],
         "frame_number": frames.number[frame],
         "tracklet_id": tracklets.name[tracklet],
-        "x_px": x_px,
-        "y_px": y_px,
+        **image._asdict(),
         **unstack("u{}", u),
         **unstack("w{}_rad_s", motion.w),
         **unstack_covariance("cov_noise_{}_rad2", cov_noise, TANGENT_AXES),
@@ -163,14 +164,12 @@ def _view_table(
         "blend_rad2": blend_rad2,
         "attitude_rad2": turn / 2,
         "turn_noise_rad2": _turn_noise(tracklets, fitted, cov_noise),
-        "field_part": _field_parts(camera, x_px, y_px),
         "first_fitted": tracklets.time_ns[fitted[:, 0]],
         "last_fitted": tracklets.time_ns[fitted[:, 1] - 1],
         **unstack("moment_{}", motion.moments, "123"),
         "unmodelled_rad2": motion.unmodelled,
         **unstack("{}_km", r_km),
         "position_sigma_km": frames.position_sigma_km[frame],
-        "pixel_rad": np.full(len(row), camera.pixel_rad),
     }
     columns = {key: values[kept] for key, values in columns.items()}
     maybe = {
@@ -239,6 +238,28 @@ def _without_blends(
     stays = (minimum[tracklet] / np.where(shared > 0.0, shared, np.inf))[:, None, None]
     more = (1 - stays) * cov_bias
     return cov_noise + more, stays * cov_bias, traces(more) / 2
+
+
+class _InImages(NamedTuple):
+    """Columns of VIEWS that depend on the camera of the frame, (n,) each."""
+
+    x_px: Array
+    y_px: Array
+    field_part: npt.NDArray[np.int8]
+    pixel_rad: Array
+
+
+def _in_images(sightings: SensorSightings, frame: Indices, u_sensor: Array) -> _InImages:
+    """Return where directions (n, 3), sensor axes, are in the images of frames (n,)."""
+    n = len(frame)
+    out = _InImages(np.empty(n), np.empty(n), np.empty(n, np.int8), np.empty(n))
+    for row, at in by_camera(sightings.frames.camera[frame]):
+        camera = camera_of(sightings.cameras, row)
+        x_px, y_px = project(camera, u_sensor[at])
+        out.x_px[at], out.y_px[at] = x_px, y_px
+        out.field_part[at] = _field_parts(camera, x_px, y_px)
+        out.pixel_rad[at] = camera.pixel_rad
+    return out
 
 
 def _field_parts(camera: Camera, x_px: Array, y_px: Array) -> npt.NDArray[np.int8]:

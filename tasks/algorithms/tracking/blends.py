@@ -68,15 +68,15 @@ class _TrackletEnds(NamedTuple):
     flux: Array
 
 
-def blend_variance(tracked: TrackedDetections, frame_s: Array, pixel_rad: float) -> Array:
+def blend_variance(tracked: TrackedDetections, frame_s: Array, pixel_rad: float | Array) -> Array:
     """Return the variance per axis [rad^2] that blends may add to each detection, (n,).
 
     Parameters
     ----------
     frame_s : (f,) float
         Times of the sensor's frames [s], increasing; those of the detections are among them.
-    pixel_rad
-        Angle of a pixel [rad].
+    pixel_rad : float or (f,) float
+        Angle of a pixel [rad], of all frames or of each: a sensor may begin to bin its pixels.
 
     Notes
     -----
@@ -84,22 +84,47 @@ def blend_variance(tracked: TrackedDetections, frame_s: Array, pixel_rad: float)
     Half of it is taken where a flux is unknown. This is the size of the error, taken as 1-sigma.
     """
     u = np.ascontiguousarray(tracked.u_icrs, float)
-    by_frame = np.argsort(tracked.time_s, kind="stable")
-    starts = np.searchsorted(tracked.time_s[by_frame], np.append(frame_s, np.inf))
+    frame_s = np.ascontiguousarray(frame_s, float)
     tracklet = np.repeat(np.arange(len(tracked.bounds) - 1), np.diff(tracked.bounds))
-    n_bins = 2 * round(BLEND_PX / BIN_PX)
-    pairs = _separations(u, by_frame, starts, BIN_PX * pixel_rad, n_bins)
-    blend_rad, frame_s = resolved_px(pairs) * pixel_rad, np.ascontiguousarray(frame_s, float)
+    alike = _with_like_pixels(tracked, u, frame_s, np.broadcast_to(pixel_rad, len(frame_s)))
     ends, out = _ends_of(tracked), np.zeros(len(tracked.time_s))
     for _ in range(2):
         # Blends are brighter. Once they are known, so are the fluxes of the objects.
         ends = ends._replace(flux=_usual_flux(tracked, out > 0))
         out[:] = 0.0
-        _enter_blends(
-            tracked.time_s, u, tracklet, by_frame, starts, tracked.bounds, frame_s, ends, blend_rad,
-            out,
-        )  # fmt: skip
+        for each in alike:
+            _enter_blends(
+                tracked.time_s, u, tracklet, each.by_frame, each.starts, tracked.bounds, frame_s,
+                ends, each.blend_rad, out,
+            )  # fmt: skip
     return out
+
+
+class _LikePixels(NamedTuple):
+    """The detections in frames with pixels of one size, and how near images blend there [rad].
+
+    Frame k has the detections ``by_frame[starts[k]:starts[k + 1]]``, none if its pixels differ.
+    """
+
+    by_frame: Indices
+    starts: Indices
+    blend_rad: float
+
+
+def _with_like_pixels(
+    tracked: TrackedDetections, u: Array, frame_s: Array, pixel_rad: Array
+) -> list[_LikePixels]:
+    """Return the detections by the size of the pixels of their frames, pixel_rad (f,)."""
+    by_time = np.argsort(tracked.time_s, kind="stable")
+    pixel = pixel_rad[np.searchsorted(frame_s, tracked.time_s[by_time])]
+    n_bins = 2 * round(BLEND_PX / BIN_PX)
+    alike = []
+    for size in np.unique(pixel).tolist():
+        by_frame = by_time[pixel == size]
+        starts = np.searchsorted(tracked.time_s[by_frame], np.append(frame_s, np.inf))
+        pairs = _separations(u, by_frame, starts, BIN_PX * size, n_bins)
+        alike.append(_LikePixels(by_frame, starts, resolved_px(pairs) * size))
+    return alike
 
 
 def of_neighbour(tracked: TrackedDetections, variance: Array) -> Flags:

@@ -1,6 +1,7 @@
 """View objects: honest errors where the attitude is a prior, whether it is off or scatters."""
 
 import numpy as np
+import pyarrow as pa
 import pytest
 from scenes.associations import filled
 from scenes.cameras import cameras_of
@@ -52,10 +53,11 @@ def views_of_priors(seed, white, constant):
     return views, stack(views, "u{}") - true[order] / np.linalg.norm(true[order], axis=1)[:, None]
 
 
-def views_of(seen, source, flux, cov_optics=None):
+def views_of(seen, source, flux, cov_optics=None, cameras=None, camera=0):
     """Views of objects by a sensor that looks along x of the ICRS, errors of its optics or not.
 
-    `seen` has the frame, the number of the object and the direction of each detection.
+    `seen` has the frame, the number of the object and the direction of each detection; `camera`
+    the row of `cameras` of each frame.
     """
     frame, item = seen["frame"], seen["item"]
     ra, dec = radec_from_unit(seen["u"])
@@ -65,7 +67,8 @@ def views_of(seen, source, flux, cov_optics=None):
     key = {"sensor_id": ["s"] * N_FRAMES, "frame_number": np.arange(N_FRAMES)}
     q = quaternion_from_matrix(np.tile(np.roll(np.eye(3), 1, axis=1), (N_FRAMES, 1, 1)))
     solutions = filled(SOLUTIONS, N_FRAMES, key | unstack("q{}", q, "xyzw") | {
-        "time": time, "attitude_source": [source] * N_FRAMES, "n_stars": np.full(N_FRAMES, 100),
+        "time": time, "attitude_source": [source] * N_FRAMES,
+        "camera": np.broadcast_to(camera, N_FRAMES), "n_stars": np.full(N_FRAMES, 100),
         **{f"cov_att_{ab}_arcsec2": np.full(N_FRAMES, stated**2 * (ab[0] == ab[1]))
            for ab in ("xx", "xy", "xz", "yy", "yz", "zz")},
         "x_km": np.full(N_FRAMES, 7000.0), **{f"{a}_km": np.zeros(N_FRAMES) for a in "yz"},
@@ -80,8 +83,9 @@ def views_of(seen, source, flux, cov_optics=None):
         "tracklet_id": name[item], "track_id": name[item], "flux": flux,
     })  # fmt: skip
     epochs = filled(EPOCHS, N_FRAMES, key | {"epoch": time, "dt_s": np.zeros(N_FRAMES)})
-    camera = cameras_of({"s": CAMERA}, cov_optics)
-    sighted = sight_objects(solutions, detections, camera, TrackletSettings(), HALF_WIDTH_S)
+    if cameras is None:
+        cameras = cameras_of({"s": CAMERA}, cov_optics)
+    sighted = sight_objects(solutions, detections, cameras, TrackletSettings(), HALF_WIDTH_S)
     views = view_objects(epochs, sighted, TrackletSettings().max_rate_deg_s, HALF_WIDTH_S)
     return views.sort_by([("tracklet_id", "ascending"), ("epoch", "ascending")])
 
@@ -183,6 +187,32 @@ def test_what_the_attitude_does_not_compensate_of_the_optics_is_a_bias(
         ]  # fmt: skip
         added_px = np.sqrt(np.trace(bias[1] - bias[0], axis1=1, axis2=2)) / PIXEL
         np.testing.assert_allclose(added_px, expected_px, atol=0.15)
+
+
+BINNED = Camera(512, 512, 1 / PIXEL / 2, 1 / PIXEL / 2, 255.5, 255.5)  # from frame 30 on
+
+
+def test_after_a_change_of_calibration_views_are_in_the_image_of_their_frame():
+    t = np.arange(N_FRAMES)
+    at = np.array([1.0, 220 * PIXEL, 0.0]) + np.outer(t * 1e-9, [0.0, 1.0, 0.0])
+    seen = {"frame": t, "item": np.zeros(N_FRAMES, int), "u": at}
+    cov_optics = np.zeros((9, 9))
+    cov_optics[2, 2] = 5.0**2  # principal point, after the change [px]
+    cameras = pa.concat_tables(
+        [cameras_of({"s": CAMERA}), cameras_of({"s": BINNED}, cov_optics)]
+    )  # fmt: skip
+    late = t >= 30
+    flux = np.full(N_FRAMES, np.nan)
+    views = views_of(seen, "prior", flux, cameras=cameras, camera=late.astype(int))
+    expected = {name: np.where(late, b, a) for name, a, b in [
+        ("x_px", 731.5, 365.5), ("y_px", 511.5, 255.5), ("pixel_rad", PIXEL, 2 * PIXEL),
+        ("field_part", 5, 5),
+    ]}  # fmt: skip
+    for name, values in expected.items():
+        np.testing.assert_allclose(array(views, name), values, atol=0.01, err_msg=name)
+    bias = stack_covariance(views, "cov_bias_{}_rad2", TANGENT_AXES)
+    added = np.trace(bias, axis1=1, axis2=2)[late] - np.trace(bias[0])
+    np.testing.assert_allclose(np.sqrt(added) / (2 * PIXEL), 5.0, atol=0.3)
 
 
 def test_a_view_has_the_mean_magnitude_of_its_detections_without_blended_ones():

@@ -67,6 +67,19 @@ def test_spots_far_from_any_other_have_no_such_error():
     assert (blend_variance(tracked, TIMES, PIXEL) == 0).all()
 
 
+def test_images_blend_by_the_pixels_of_their_frame():
+    tracked, _, blended = passing(0)
+    late, fine = TIMES > 40, PIXEL / 100
+    assert (blend_variance(tracked, TIMES, fine) == 0).all()
+    np.testing.assert_array_equal(
+        blend_variance(tracked, TIMES, np.full(len(TIMES), PIXEL)),
+        blend_variance(tracked, TIMES, PIXEL),
+    )
+    mixed = blend_variance(tracked, TIMES, np.where(late, PIXEL, fine))[: len(TIMES)]
+    assert (mixed[blended & late] > 0).all()
+    assert (mixed[~late] == 0).all()
+
+
 def test_an_object_that_goes_on_as_another_tracklet_is_no_neighbour():
     rng = np.random.default_rng(1)
     path = np.column_stack([0.3 * TIMES, np.zeros(len(TIMES))])
