@@ -222,7 +222,8 @@ class Reason(StrEnum):
     DUPLICATE_STATE = (
         "duplicate_state",
         Stage.READ,
-        "Another state of the sensor has the same time.",
+        "Another state of the sensor has the same time; one with an attitude is kept, of several "
+        "the one with the smallest position sigma.",
         Trait.HARMLESS,
     )
     # Of a calibration.

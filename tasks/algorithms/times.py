@@ -287,12 +287,16 @@ def order_frames(
     return order, verdict
 
 
-def order_states(sensor: Integers, time_ns: Integers) -> tuple[Integers, Flags]:
+def order_states(
+    sensor: Integers, time_ns: Integers, has_attitude: Flags, position_sigma_km: Array
+) -> tuple[Integers, Flags]:
     """Return the order of states by sensor and time, and which of them repeat their predecessor.
 
-    A state repeats if sensor and time are the same; the first given is kept.
+    A state repeats if sensor and time are the same. One with an attitude is kept, of several the
+    one with the smallest position sigma (0: unknown), of equal ones the first given.
     """
-    order = np.lexsort((np.arange(len(sensor)), time_ns, sensor))
+    sigma_km = np.where(position_sigma_km > 0, position_sigma_km, np.inf)
+    order = np.lexsort((np.arange(len(sensor)), sigma_km, ~has_attitude, time_ns, sensor))
     s, t = sensor[order], time_ns[order]
     repeats = np.zeros(len(order), bool)
     repeats[1:] = (s[1:] == s[:-1]) & (t[1:] == t[:-1])

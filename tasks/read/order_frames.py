@@ -347,7 +347,12 @@ def _sorted_states(
         states.append(rows_with(all_states, "sensor_id", sensor.sensor_id))
         names += [source.name] * states[-1].num_rows
     rows = concat(LOG_STATES, states)
-    order, repeats = order_states(np.zeros(rows.num_rows, np.int64), array(rows, "time"))
+    order, repeats = order_states(
+        np.zeros(rows.num_rows, np.int64),
+        array(rows, "time"),
+        pc.is_valid(rows["qx"]).to_numpy(),
+        array(rows, "position_sigma_km"),
+    )
     named = rows.select(["sensor_id", "time"]).append_column("source", pa.array(names, pa.string()))
     rejects = frames_left_out(named.take(pa.array(order[repeats])), Reason.DUPLICATE_STATE)
     return states_to_gcrf(rows.take(pa.array(order[~repeats])), settings.position_sigma_km), rejects

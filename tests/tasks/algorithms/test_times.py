@@ -235,9 +235,18 @@ def test_the_interval_about_each_of_many_pairs_of_exposures_is_half_that_of_the_
 
 
 def test_states_of_one_time_count_once_and_the_first_given_is_kept():
-    order, repeats = order_states(np.array([1, 0, 1, 1]), np.array([5, 9, 5, 4]))
+    alike = np.ones(4, bool), np.full(4, 0.1)
+    order, repeats = order_states(np.array([1, 0, 1, 1]), np.array([5, 9, 5, 4]), *alike)
     assert list(order) == [1, 3, 0, 2]
     assert list(repeats) == [False, False, False, True]
+
+
+def test_of_states_of_one_time_the_one_with_an_attitude_and_the_best_position_is_kept():
+    sigma_km = np.array([0.01, 0.0, 5.0, 0.1, 0.1])  # 0: unknown
+    has_attitude = np.array([False, True, True, True, True])
+    order, repeats = order_states(np.zeros(5, int), np.zeros(5, int), has_attitude, sigma_km)
+    assert list(order) == [3, 4, 2, 1, 0]
+    assert list(repeats) == [False, True, True, True, True]
 
 
 @pytest.mark.parametrize(

@@ -122,6 +122,22 @@ def test_overlapping_logs_give_each_frame_and_state_once_in_any_order(tmp_path):
     assert log.sources == other.sources
 
 
+@pytest.mark.parametrize("names", [("a", "b"), ("b", "a")])
+def test_of_two_logs_with_states_of_the_same_times_those_with_attitudes_are_kept(tmp_path, names):
+    attitudes = ([0.0, 0.0, 0.0, 1.0], None)
+    paths = [tmp_path / f"{name}.mcap" for name in names]
+    for path, q, sigma_km in zip(paths, attitudes, (5.0, 0.01), strict=True):
+        with LogWriter(path) as log:
+            log.frame("s", START_NS, frame_number=0, exposure_s=0.1, x_px=[1.0], y_px=[1.0])
+            for k in range(5):
+                log.state("s", START_NS + k * SECOND_NS, frame="GCRF", attitude_xyzw=q,
+                          position_km=[7000.0, k, 0.0], position_sigma_km=sigma_km)  # fmt: skip
+    log = read(*paths)
+    assert log.states["qx"].null_count == 0
+    assert array(log.states, "position_sigma_km").tolist() == [5.0] * 5
+    assert ("duplicate_state", "s", f"{names[1]}.mcap", 5) in rows(log)
+
+
 def test_after_a_restart_of_the_counter_numbers_go_on(tmp_path):
     a = write(tmp_path / "a.mcap", "s", [(0, 0), (1, 1), (2, 2), (10, 0), (11, 1), (12, 7)])
     log = read(a)
