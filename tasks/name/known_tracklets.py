@@ -85,8 +85,8 @@ def name_tracklets(
     folder
         The night's folder; its `tracklets` are written.
     objects
-        The satellites of objects that have positions, which are named by these; None where an
-        object is no known one.
+        The satellites of objects that have positions, which are named by these; None where one
+        is unknown.
     catalogue
         Its errors of elements are those that the night's objects show.
     min_probability
