@@ -4,7 +4,7 @@ Association judges windows of ten minutes at most; an orbit joins tracklets over
 sensors saw such an object at the same epochs, it has positions there like any other.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -14,7 +14,7 @@ from scipy.special import chdtrc
 
 from epipole.io.work.parts import NUMBERED, write_part
 from epipole.io.work.work_layout import SolvedParts, ViewedParts
-from epipole.schemas.arrays import Flags, Indices
+from epipole.schemas.arrays import Indices
 from epipole.schemas.bridge import array, concat, from_polars, to_polars
 from epipole.schemas.spans import Span, spans_between
 from epipole.schemas.stages import Stage
@@ -30,7 +30,9 @@ from epipole.tasks.solve.view_groups import ViewGroups, unpack_views, with_large
 # Least share of a linked tracklet's views that agree with those of other sensors at their epochs.
 # Nearly all of a true one do; of a wrong pair in a scene of six sensors 6 of 31.
 MIN_AGREEING = 0.5
-_AGREEING = {"tracklet_id": pl.String, "agrees": pl.Boolean}
+_NO_VIEWS = pl.DataFrame(
+    schema={"object": pl.Int64, "tracklet_id": pl.String, "agrees": pl.Boolean}
+)
 SERVED_NS = 60_000_000_000  # longest time between an epoch and the frame that is used for it
 
 
@@ -122,19 +124,19 @@ def add_linked_members(
     for span in spans:
         linked = _linked_members(joined, span.widened(margin_ns), viewed)
         if len(linked):
-            found[span] = _renumbered(solved.objects.read(span, "members"), one, linked), linked
-    agreeing = [
-        _agreeing_views(*of_span, span, margin_ns, reject_sigma, viewed, solved)
-        for span, of_span in found.items()
-    ]
-    refused = _refused(agreeing)
+            members = _renumbered(solved.objects.read(span, "members"), one, linked)
+            seen = _shared_views(members, linked, span.widened(margin_ns), viewed, max_views)
+            errors = [solved.errors.read(span, "errors")] if solved.errors.holds(span) else []
+            larger = concat(SHARED_ERRORS, errors)
+            agreeing = [_agreeing_views(*each, linked, larger, reject_sigma) for each in seen]
+            found[span] = members, linked, pl.concat([_NO_VIEWS, *agreeing])
+    refused = _refused([views for *_, views in found.values()])
     pieces = []
-    for span, (members, linked) in found.items():
-        kept = linked.filter(pl.col("tracklet_id").is_in(refused).not_())
-        views, number = _shared_views(members, kept, span.widened(margin_ns), viewed)
-        shared = np.unique(number[_of(kept, views)]).tolist()
+    for span, (members, linked, views) in found.items():
+        kept = pl.col("tracklet_id").is_in(refused).not_()
+        shared = views.filter(kept)["object"].unique().to_list()
         if shared:
-            rows, changed = _with_linked(members, kept, shared, span, max_views)
+            rows, changed = _with_linked(members, linked.filter(kept), shared, span, max_views)
             tables = {"members": from_polars(OBJECT_MEMBERS, rows)}
             write_part(solved.with_links().objects.of(span), NUMBERED, tables)
             pieces += changed
@@ -186,39 +188,32 @@ def _renumbered(members: pa.Table, one: Mapping[int, int], linked: pl.DataFrame)
 
 
 def _shared_views(
-    members: pl.DataFrame, linked: pl.DataFrame, time: Span, viewed: ViewedParts
-) -> tuple[pa.Table, Indices]:
-    """Return the views of objects with linked tracklets; see `gather_views`."""
+    members: pl.DataFrame, linked: pl.DataFrame, time: Span, viewed: ViewedParts, max_views: int
+) -> Iterator[tuple[pa.Table, Indices]]:
+    """Yield the views of some objects with linked tracklets after others; see `gather_views`."""
     of_linked = members.filter(pl.col("object").is_in(linked["object"].unique().implode()))
-    rows = from_polars(OBJECT_MEMBERS, pl.concat([of_linked, linked]))
-    return gather_views(viewed, rows, time)
-
-
-def _of(linked: pl.DataFrame, views: pa.Table) -> Flags:
-    """Return which views are of linked tracklets."""
-    return np.isin(views["tracklet_id"].to_pylist(), linked["tracklet_id"].to_list())
+    rows = in_pieces(pl.concat([of_linked, linked]), time, max_views)
+    for _, of_piece in rows.group_by("piece", maintain_order=True):
+        yield gather_views(viewed, from_polars(OBJECT_MEMBERS, of_piece), time)
 
 
 def _agreeing_views(
-    members: pl.DataFrame, linked: pl.DataFrame, span: Span, margin_ns: int, reject_sigma: float,
-    viewed: ViewedParts, solved: SolvedParts,
-) -> pl.DataFrame:  # fmt: skip
-    """Return the views of linked tracklets, and which of them agree with the others' in a position.
+    views: pa.Table, number: Indices, linked: pl.DataFrame, errors: pa.Table, reject_sigma: float
+) -> pl.DataFrame:
+    """Return the views of linked tracklets, and which agree with those of others in a position.
 
     Two views make a position however far they miss each other: its chi-square tells.
     """
-    views, number = _shared_views(members, linked, span.widened(margin_ns), viewed)
-    errors = [solved.errors.read(span, "errors")] if solved.errors.holds(span) else []
-    groups = solve_positions(
-        with_larger_errors(unpack_views(views, number), concat(SHARED_ERRORS, errors)), reject_sigma
-    )
+    seen = with_larger_errors(unpack_views(views, number), errors)
+    groups = solve_positions(seen, reject_sigma)
     fits = groups.solved & (chdtrc(_dof(groups), groups.chi2) > MIN_PROBABILITY)
-    labels, agrees = groups.views.labels, groups.used & fits[groups.group]
-    rows = np.flatnonzero(_of(linked, labels))
-    return pl.DataFrame(
-        {"tracklet_id": labels["tracklet_id"].take(rows).to_pylist(), "agrees": agrees[rows]},
-        schema=_AGREEING,
-    )
+    columns = {
+        "object": groups.views.object_number,
+        "tracklet_id": groups.views.labels["tracklet_id"].to_pylist(),
+        "agrees": groups.used & fits[groups.group],
+    }
+    rows = pl.DataFrame(columns, schema=_NO_VIEWS.schema)
+    return rows.filter(pl.col("tracklet_id").is_in(linked["tracklet_id"].implode()))
 
 
 def _dof(groups: ViewGroups) -> Indices:
@@ -229,7 +224,7 @@ def _dof(groups: ViewGroups) -> Indices:
 
 def _refused(agreeing: Sequence[pl.DataFrame]) -> list[str]:
     """Return the tracklets of which too few views agree."""
-    views = pl.concat([pl.DataFrame(schema=_AGREEING), *agreeing])
+    views = pl.concat([_NO_VIEWS, *agreeing])
     shares = views.group_by("tracklet_id").agg(pl.col("agrees").mean())
     return sorted(shares.filter(pl.col("agrees") < MIN_AGREEING)["tracklet_id"])
 

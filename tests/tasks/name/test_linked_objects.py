@@ -29,7 +29,6 @@ MARGIN_NS = 30 * SECOND_NS
 SPAN, NEXT = SPANS[:2]
 # Tracklets: name, sensor, object, first and last second. Those of "x" are of an object.
 TEN = [*range(0, 10, 2)]
-AGREEING = linked_objects._AGREEING
 
 
 def tracklets(*rows):
@@ -74,7 +73,13 @@ def test_a_linked_tracklet_that_no_other_sensor_shares_does_not(other):
 @pytest.fixture
 def all_meet(monkeypatch):
     """Lines of sight that meet: these views have no directions."""
-    monkeypatch.setattr(linked_objects, "_agreeing_views", lambda *_: pl.DataFrame(schema=AGREEING))
+
+    def agreeing(views, number, linked, *_):
+        names = views["tracklet_id"].to_pylist()
+        rows = pl.DataFrame({"object": number, "tracklet_id": names, "agrees": [True] * len(names)})
+        return rows.filter(pl.col("tracklet_id").is_in(linked["tracklet_id"].implode()))
+
+    monkeypatch.setattr(linked_objects, "_agreeing_views", agreeing)
 
 
 def solved_spans(folder, *rows, pieces=None):
