@@ -37,7 +37,7 @@ TINY = {
     "many_sensors": "ring --sensors 8",
     "night": "--shares 1 --hours 0.02",
     "orbit_fits": "--seeds 1",
-    "orbit_linking": "--satellites 60 --hours 0.1",
+    "orbit_linking": "--satellites 20 --hours 0.03",
     "page": "--rounds 1",
     "passages": "--satellites 2 --seeds 1 --seconds 20",
     "photographs": "{folder}/list.csv --width 1024 --height 1024 --field 20 --year 2024 --reach 0",

@@ -114,10 +114,15 @@ def draw_stop(rng: random.Random) -> Stop:
 
 
 class StoppedRuns:
-    """Runs in one folder, and the two datasets that they may give."""
+    """Runs in one folder, and the two datasets that they may give.
 
-    def __init__(self, folder: Path, logs: list[Path], whole: list[Contents]) -> None:
-        self.folder, self.logs, self.whole = folder, logs, whole
+    `settings` is a file for all runs; None: as users without one have them.
+    """
+
+    def __init__(
+        self, folder: Path, logs: list[Path], whole: list[Contents], settings: Path | None = None
+    ) -> None:
+        self.folder, self.logs, self.whole, self.settings = folder, logs, whole, settings
         self.temporary, self.home = folder / "temporary", folder / "prefect"
         self.temporary.mkdir()
         self.out = folder / "out"
@@ -154,7 +159,7 @@ class StoppedRuns:
         kept = {name: value for name, value in os.environ.items() if "PREFECT" not in name}
         own = {"TMPDIR": str(self.temporary), "PREFECT_HOME": str(self.home)}
         asked = ["run", str(self.logs[log]), "--out", str(self.out), "--replace", "--again"]
-        asked.append("--quiet")
+        asked += ["--quiet", *(["--settings", str(self.settings)] if self.settings else [])]
         return subprocess.Popen(
             [sys.executable, "-c", code, *arguments, *asked], env=kept | own,
             stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True,
