@@ -215,6 +215,7 @@ def make_nights(order: Order, night: str | None) -> Summary:
         chosen = choose_nights(given.paths, nights, night, frames.rejects)
         sources = source_table(frames.sources, settings)
         check_sources(out, chosen, sources, replace)
+        run_key = [*frames.sensors, *sorted(log.sha256 for log in frames.sources)]
         staged: dict[str, Path] = {}
         with lock_nights(out, [] if night else chosen) as staging, ExitStack() as kept:
             for date in chosen:
@@ -222,7 +223,6 @@ def make_nights(order: Order, night: str | None) -> Summary:
                     LOGGER.info("night %s", date)
                 made = gave_something(frames.sources, frames.rejects, date)
                 recipe = recipe_of(night_logs_key(given, date, made), settings, known_key)
-                run_key = [*frames.sensors, *sorted(log.sha256 for log in frames.sources)]
                 work = work_folder(work_root(out), date, recipe, settings.work.keep, run_key)
                 folder = kept.enter_context(work)
                 rejects = into_nights(

@@ -216,10 +216,8 @@ def solve_linked(
 
     Parameters
     ----------
-    tracklets
-        TRACKLETS of the run, with their objects.
-    linked
-        LINKED_TRACKLETS.
+    tracklets, linked
+        As of `tracklets_at_once`.
     names
         Ids of the night, after linking.
 

@@ -34,9 +34,8 @@ class Recipe(NamedTuple):
         `run` are the sensors and logs of the run, also of other nights: parts lie under the numbers
         of sensors in the run, and a calibration holds from its log on.
         """
-        return digest_of((self.logs, self.settings, night, self.star_catalogue, self.code, *run))[
-            :16
-        ]
+        whole = (self.logs, self.settings, night, self.star_catalogue, self.code, *run)
+        return digest_of(whole)[:16]
 
 
 def recipe_of(logs: str, settings: Settings, known: str | None = None) -> Recipe:

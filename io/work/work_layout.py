@@ -30,8 +30,10 @@ from typing import NamedTuple
 import pyarrow as pa
 
 from epipole.io.work.parts import Parts, read_part
+from epipole.schemas.bridge import concat
 from epipole.schemas.spans import Sensor, Span
 from epipole.schemas.stages import Stage
+from epipole.schemas.work_tables import SHARED_ERRORS
 
 
 class ReadFolder(NamedTuple):
@@ -135,6 +137,11 @@ class SolvedParts(NamedTuple):
     def errors(self) -> Parts:
         """The sensors of each span whose shared errors are larger than stated: `JUDGED`."""
         return Parts(self.root / "errors", self.kept)
+
+    def shared_errors(self, span: Span) -> pa.Table:
+        """Return SHARED_ERRORS of a span; empty where no sensor's are larger than stated."""
+        read = [self.errors.read(span, "errors")] if self.errors.holds(span) else []
+        return concat(SHARED_ERRORS, read)
 
     def piece(self, span: Span, piece: int) -> Path:
         """Return the part of some objects of a span: `SOLVED`."""

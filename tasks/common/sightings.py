@@ -136,9 +136,9 @@ def row_offsets_s(cameras: pa.Table, camera: Integers, y_px: Array) -> Array:
     late_s = np.zeros(len(y_px))
     if not cameras.num_rows or not array(cameras, "line_time_s").any():
         return late_s
-    for k in np.unique(camera[camera >= 0]).tolist():
-        at = camera == k
-        late_s[at] = row_offset_s(camera_of(cameras, k), y_px[at].astype(float))
+    for row, at in by_camera(camera):
+        if row >= 0:
+            late_s[at] = row_offset_s(camera_of(cameras, row), y_px[at].astype(float))
     return late_s
 
 

@@ -15,12 +15,13 @@ from scipy.special import chdtrc
 from epipole.io.work.parts import NUMBERED, write_part
 from epipole.io.work.work_layout import SolvedParts, ViewedParts
 from epipole.schemas.arrays import Indices
-from epipole.schemas.bridge import array, concat, from_polars, to_polars
+from epipole.schemas.bridge import array, from_polars, to_polars
 from epipole.schemas.spans import Span, spans_between
 from epipole.schemas.stages import Stage
-from epipole.schemas.work_tables import LINKED_TRACKLETS, OBJECT_MEMBERS, SHARED_ERRORS
+from epipole.schemas.work_tables import LINKED_TRACKLETS, OBJECT_MEMBERS
 from epipole.tasks.common.stage_tasks import stage_task
 from epipole.tasks.name.object_ids import Names, number_of
+from epipole.tasks.solve.align_epochs import SERVED_NS
 from epipole.tasks.solve.number_objects import in_pieces, within
 from epipole.tasks.solve.positions import solve_positions
 from epipole.tasks.solve.solve_piece import Piece, gather_views
@@ -33,7 +34,6 @@ MIN_AGREEING = 0.5
 _NO_VIEWS = pl.DataFrame(
     schema={"object": pl.Int64, "tracklet_id": pl.String, "agrees": pl.Boolean}
 )
-SERVED_NS = 60_000_000_000  # longest time between an epoch and the frame that is used for it
 
 
 class LinkedMembers(NamedTuple):
@@ -68,10 +68,8 @@ def tracklets_at_once(tracklets: pl.DataFrame, linked: pa.Table) -> pl.DataFrame
     rows = rows.with_columns(linked=is_linked).filter(pl.col("linked").any().over("object_id"))
     rows = rows.sort("object_id", "start_time", "tracklet_id")
     seen_until = pl.col("end_time").cum_max().shift().over("object_id")
-    begins = (pl.col("start_time") > seen_until + pl.duration(nanoseconds=SERVED_NS)).fill_null(
-        True
-    )
-    together = rows.with_columns(run=begins.cum_sum())
+    begins = pl.col("start_time") > seen_until + pl.duration(nanoseconds=SERVED_NS)
+    together = rows.with_columns(run=begins.fill_null(True).cum_sum())
     several = pl.col("sensor_id").n_unique().over("run") > 1
     return together.filter(several, "linked").select(columns)
 
@@ -126,9 +124,8 @@ def add_linked_members(
         if len(linked):
             members = _renumbered(solved.objects.read(span, "members"), one, linked)
             seen = _shared_views(members, linked, span.widened(margin_ns), viewed, max_views)
-            errors = [solved.errors.read(span, "errors")] if solved.errors.holds(span) else []
-            larger = concat(SHARED_ERRORS, errors)
-            agreeing = [_agreeing_views(*each, linked, larger, reject_sigma) for each in seen]
+            errors = solved.shared_errors(span)
+            agreeing = [_agreeing_views(*each, linked, errors, reject_sigma) for each in seen]
             found[span] = members, linked, pl.concat([_NO_VIEWS, *agreeing])
     refused = _refused([views for *_, views in found.values()])
     pieces = []
@@ -218,8 +215,7 @@ def _agreeing_views(
 
 def _dof(groups: ViewGroups) -> Indices:
     """Return the degrees of freedom of each position: two angles of each view, less three."""
-    n_used = np.bincount(groups.group, groups.used, minlength=len(groups.epoch_ns))
-    return np.maximum(2 * n_used.astype(np.int64) - 3, 1)
+    return np.maximum(2 * groups.n_used - 3, 1)
 
 
 def _refused(agreeing: Sequence[pl.DataFrame]) -> list[str]:

@@ -16,9 +16,8 @@ import pyarrow as pa
 from epipole.io.work.parts import read_part
 from epipole.schemas.bridge import concat, from_polars, to_polars
 from epipole.schemas.observation import FITTED_FIELDS
-from epipole.schemas.spans import Span
 from epipole.schemas.tables import OBSERVATIONS
-from epipole.schemas.work_tables import SHARED_ERRORS, SIGHTINGS
+from epipole.schemas.work_tables import SIGHTINGS
 from epipole.tasks.common.sightings import MARK
 from epipole.tasks.publish.hot_tracklets import hot_tracklets
 from epipole.tasks.publish.night_parts import NightParts, in_slices
@@ -37,7 +36,7 @@ def observations(parts: NightParts) -> Iterator[pa.Table]:
     for span in parts.spans:
         viewed_parts = [of.viewed for of in parts.sensors if of.viewed.holds(span)]
         tables = [partial(viewed.read, span, "sightings") for viewed in viewed_parts]
-        errors = shared_errors(parts, span)
+        errors = to_polars(parts.solved.shared_errors(span))
         for rows in in_slices(tables, span, "time"):
             seen = with_objects(to_polars(concat(SIGHTINGS, rows)), runs)
             seen = seen.filter(pl.col("tracklet_id").is_in(hot.implode()).not_())
@@ -188,13 +187,6 @@ def _asof(
         runs.sort(edge), left_on="time", right_on=edge, by="tracklet_id", strategy=strategy,
         check_sortedness=False,
     )  # fmt: skip
-
-
-def shared_errors(parts: NightParts, span: Span) -> pl.DataFrame:
-    """Return SHARED_ERRORS of a span; empty where no sensor's are larger than stated."""
-    errors = parts.solved.errors
-    tables = [errors.read(span, "errors")] if errors.holds(span) else []
-    return to_polars(concat(SHARED_ERRORS, tables))
 
 
 def with_shared_errors(rows: pl.DataFrame, errors: pl.DataFrame, more_km: float) -> pl.DataFrame:

@@ -33,10 +33,10 @@ from epipole.tasks.publish.observed_objects import (
     longest_object,
     object_runs,
     observations,
-    shared_errors,
     with_links,
     with_shared_errors,
 )
+from epipole.tasks.solve.align_epochs import SERVED_NS
 
 # These tables may not fit in memory as a whole: they are written in slices of time.
 BY_SENSOR = ("frames", "stars", "detections")
@@ -45,7 +45,6 @@ WHOLE = ("tracklets", "calibrations", "checks", "sources", "rejects")
 # The tables of one task each; stars are most of the work.
 SHARES = (("stars",), ("detections",), ("observations",), ("frames",), (*BY_SPAN, *WHOLE))
 DECIDED_BY_ORBITS = (Reason.AMBIGUOUS, Reason.UNDECIDED)
-SERVED_NS = 60_000_000_000  # longest time between an epoch and the frame that is used for it
 
 
 @stage_task(Stage.PUBLISH, "{tables[0]} of {parts.night}")
@@ -103,7 +102,7 @@ def _attributables(parts: NightParts, span: Span, sensors: pl.DataFrame) -> pl.D
     viewed = [of.viewed for of in parts.sensors if of.viewed.holds(span)]
     rows = to_polars(concat(ATTRIBUTABLES, [each.read(span, "attributables") for each in viewed]))
     rows = rows.join(sensors, on="tracklet_id", how="left", maintain_order="left")
-    errors = shared_errors(parts, span)
+    errors = to_polars(parts.solved.shared_errors(span))
     return with_shared_errors(rows, errors, parts.solved.more_km).drop("sensor_id")
 
 

@@ -19,6 +19,8 @@ from epipole.tasks.algorithms.times import (
     nearest_frame,
 )
 
+SERVED_NS = 60_000_000_000  # longest time between an epoch and the frame that is used for it
+
 
 class EpochGrid(NamedTuple):
     """The epochs of a whole night, the same for each of its spans."""

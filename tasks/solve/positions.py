@@ -169,7 +169,7 @@ def _velocities(epoch_ns: Indices, number: Indices, x_km: Array) -> tuple[Array,
 def position_table(groups: ViewGroups) -> pa.Table:
     """Return POSITIONS of the groups that have one."""
     solved = groups.solved
-    n_used = np.bincount(groups.group, groups.used, minlength=len(solved)).astype(np.int32)
+    n_used = groups.n_used.astype(np.int32)
     light_ns = np.nan_to_num(groups.mean_range_km / SPEED_OF_LIGHT_KM_S * 1e9)
     columns = {
         "epoch": groups.epoch_ns,
@@ -192,9 +192,8 @@ def _residual_px(groups: ViewGroups) -> Array:
     sight /= np.linalg.norm(sight, axis=1, keepdims=True)
     distance2 = np.sum((sight - groups.views.u) ** 2, axis=1) / groups.views.pixel_rad**2
     square = np.where(groups.used, distance2, 0.0)
-    size = len(groups.epoch_ns)
-    count = np.maximum(np.bincount(groups.group, groups.used, minlength=size), 1)
-    return np.sqrt(np.bincount(groups.group, square, minlength=size) / count)
+    total = np.bincount(groups.group, square, minlength=len(groups.epoch_ns))
+    return np.sqrt(total / np.maximum(groups.n_used, 1))
 
 
 def reject_table(groups: ViewGroups) -> pa.Table:

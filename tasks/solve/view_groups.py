@@ -189,6 +189,12 @@ class ViewGroups(NamedTuple):
         return np.isfinite(self.chi2)
 
     @property
+    def n_used(self) -> Indices:
+        """Number of views of each group that take part in its solution."""
+        count = np.bincount(self.group, self.used, minlength=len(self.epoch_ns))
+        return count.astype(np.int64)
+
+    @property
     def apparent_km(self) -> Array:
         """Position at which the sensor of each view sees the object: where its light left."""
         group = self.group

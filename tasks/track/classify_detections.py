@@ -12,7 +12,7 @@ from epipole.tasks.algorithms.geometry.directions import matrix_from_quaternion
 from epipole.tasks.algorithms.geometry.turning import angular_rates, turned
 from epipole.tasks.algorithms.orbits.planets import planet_directions
 from epipole.tasks.algorithms.tracking.hot_pixels import FixedPositions, fixed_positions
-from epipole.tasks.common.sightings import Frames, Sightings, camera_of, row_offsets_s
+from epipole.tasks.common.sightings import Frames, Sightings, by_camera, camera_of, row_offsets_s
 
 GATE_SIGMA = 4.0  # largest distance of a detection from a known hot pixel, planet or star
 
@@ -89,8 +89,7 @@ def star_directions(frames: Frames, stars: pa.Table, cameras: pa.Table) -> Array
     x_px, y_px, frame = array(stars, "x_px")[known], array(stars, "y_px")[known], frame[known]
     R = matrix_from_quaternion(frames.q_sensor_from_icrs)
     camera, u = frames.camera[frame], np.empty((len(frame), 3))
-    for row in np.unique(camera).tolist():
-        of = camera == row
+    for row, of in by_camera(camera):
         u[of] = unproject(camera_of(cameras, row), x_px[of], y_px[of])
     row_s = row_offsets_s(cameras, camera, y_px)
     if row_s.any():  # as they were at the times of the frames

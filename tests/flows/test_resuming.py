@@ -10,6 +10,7 @@ from pathlib import Path
 
 import pytest
 from scenes.dataset_tables import contents
+from scenes.killed_runs import without_report
 
 import epipole.flows.nightly as nightly_module
 from epipole.flows.nightly import nightly
@@ -29,8 +30,7 @@ COMMAND = "from epipole.flows.command_line.main import main; main()"
 def run(night_log, tmp_path):
     """Return a function that starts `epipole run` of the shared night in its own process."""
     started = []
-    plain = tmp_path / "plain.toml"  # a report takes as long as all the rest
-    plain.write_text("report.write = false\n")
+    plain = without_report(tmp_path)
 
     def start(out: Path) -> subprocess.Popen:
         asked = ["run", str(night_log), "--out", str(out), "--again", "--settings", str(plain)]

@@ -233,6 +233,13 @@ def _processes(home: Path) -> list[str]:
     return found
 
 
+def without_report(folder: Path) -> Path:
+    """Return a file of settings in a folder: a report takes as long as all the rest of a run."""
+    file = folder / "plain.toml"
+    file.write_text("report.write = false\n")
+    return file
+
+
 def make_logs(folder: Path) -> list[Path]:
     """Return two logs of the same two nights, with other noise."""
     from epipole.flows.simulate import simulate

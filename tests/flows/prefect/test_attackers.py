@@ -24,6 +24,7 @@ import pytest
 import websockets
 from prefect.states import Completed, Failed
 from scenes.dataset_tables import contents
+from scenes.killed_runs import without_report
 from scenes.prefect_server import EPIPOLE, serving
 
 from epipole.flows.prefect.artifacts import run_here, shown_on_page
@@ -147,9 +148,7 @@ def attackers(tmp_path) -> Iterator[Callable[..., Attacker]]:
 
 
 def run(log: Path, out: Path, **settings: str) -> subprocess.CompletedProcess[str]:
-    """Run a log, without a report: it takes as long as all the rest."""
-    plain = out.with_name("plain.toml")
-    plain.write_text("report.write = false\n")
+    plain = without_report(out.parent)
     return subprocess.run(
         [*EPIPOLE, "run", str(log), "--out", str(out), "--settings", str(plain)],
         env=environment(**settings), capture_output=True, text=True, timeout=600,
