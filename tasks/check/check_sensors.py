@@ -24,6 +24,7 @@ from epipole.tasks.algorithms.sensor_faults.fault_judgement import (
     CLOCK,
     DISAGREES,
     EPHEMERIS,
+    MIN_OBJECTS,
     SOUND,
     Doubt,
     Lines,
@@ -204,10 +205,11 @@ def sensor_verdicts(
 ) -> JudgedSights:
     """Return the verdicts on those sensors that CLOCK_LINES can judge, by sensor.
 
-    `first_guess` has initial clock offsets by sensor [s].
+    `first_guess` has initial clock offsets by sensor [s]. Sensors with fewer than `MIN_OBJECTS`
+    objects that others see too are not judged.
     """
     guess = first_guess or {}
-    rows = rows.sort("epoch", "object_id", "sensor_id")
+    rows = _with_enough_objects(rows).sort("epoch", "object_id", "sensor_id")
     if not len(rows):
         return JudgedSights([])
     # A quantile: blends in a few tracklets are not an error of the attitude.
@@ -229,6 +231,24 @@ def sensor_verdicts(
     ]
     known = [one for one in verdicts if one.sigma_s < MAX_KNOWN_SIGMA_S or one.is_faulty]
     return JudgedSights(known, judged.doubt)
+
+
+def _with_enough_objects(rows: pl.DataFrame) -> pl.DataFrame:
+    """Return the rows of sensors with `MIN_OBJECTS` objects or more that others of them see too.
+
+    An error in the views of one object, such as those of its neighbour, looks like a fault of the
+    sensor. Other objects contradict it.
+    """
+    # The id in the night begins with the span: an object counts once in all spans.
+    rows = rows.with_columns(object=pl.col("object_id").str.split("/").list.last())
+    while True:
+        shared = rows.filter(pl.len().over("epoch", "object_id") > 1)
+        count = shared.group_by("sensor_id").agg(n=pl.col("object").n_unique())
+        enough = count.filter(pl.col("n") >= MIN_OBJECTS)["sensor_id"]
+        kept = rows.filter(pl.col("sensor_id").is_in(enough.implode()))
+        if len(kept) == len(rows):
+            return rows.drop("object")
+        rows = kept
 
 
 def _search_clock(free: pl.DataFrame) -> tuple[float, pl.DataFrame] | None:

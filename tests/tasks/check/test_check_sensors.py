@@ -1,6 +1,7 @@
 """Check of sensors: what was corrected and what remains; nothing from nothing."""
 
 import numpy as np
+import polars as pl
 import pytest
 from scenes.associations import filled
 from scenes.late_sensors import POSITION_KM, SIGMA, lines_of
@@ -83,6 +84,35 @@ def test_errors_of_optics_that_differ_over_the_field_are_no_faults_of_sensors():
     alike = sensor_verdicts(rows_of(lines, PER_OBJECT**2))
     faulty = any(one.is_faulty for one in alike.verdicts)
     assert faulty or alike.doubt.undecided or alike.doubt.spread_log_odds > 6.0
+
+
+@pytest.mark.parametrize(("n_objects", "faulty"), [(1, []), (2, []), (3, ["s3"])])
+def test_a_sensor_with_one_or_two_objects_is_not_judged(n_objects, faulty):
+    """All its lines are off alike by 5 sigmas of one."""
+    lines = lines_of(1, np.zeros(4))
+    kept = (lines.sensor != 3) | (lines.group < 60 * n_objects)
+    lines = lines._replace(**{name: getattr(lines, name)[kept] for name in lines._fields})
+    u = lines.u + np.where(lines.sensor == 3, 5 * SIGMA, 0.0)[:, None] * [0.0, 0.0, 1.0]
+    lines = lines._replace(u=u / np.linalg.norm(u, axis=1)[:, None])
+    rows = rows_of(lines, 0.0).with_columns(cov_bias_11_rad2=0.0, cov_bias_22_rad2=0.0)
+    # In another span an object has the same number.
+    late = pl.col("epoch") > rows["epoch"].median()
+    span = pl.when(late).then(pl.lit("1/")).otherwise(pl.lit("0/"))
+    rows = rows.with_columns(object_id=span + pl.col("object_id"))
+    judged = sensor_verdicts(rows)
+    assert [one.sensor_id for one in judged.verdicts if one.is_faulty] == faulty
+    assert [one.sensor_id for one in judged.verdicts][:3] == ["s0", "s1", "s2"]
+    assert not judged.doubt.undecided
+    assert judged.doubt.spread_log_odds < 3.0
+
+
+def test_a_sensor_that_shares_objects_only_with_such_ones_is_not_judged():
+    lines = lines_of(1, np.zeros(4))
+    number = lines.group // 60
+    # Sensor 0 sees three objects, each with one other sensor, which sees no more.
+    kept = np.where(lines.sensor == 0, number < 3, number == lines.sensor - 1)
+    lines = lines._replace(**{name: getattr(lines, name)[kept] for name in lines._fields})
+    assert sensor_verdicts(rows_of(lines, 0.0)) == JudgedSights([])
 
 
 def offsets_in_sigmas(seed, noise, turn_noise):
