@@ -17,7 +17,8 @@ An offset that all clocks share counts as one fault. It moves all sensors along 
 
 import itertools
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -320,11 +321,7 @@ def _explain(
             judge(frozenset(fault for fault in chosen if fault is not None))
         best = max(score, key=judge)
     else:
-        while True:
-            better = max([best, *_neighbouring_sets(best, kinds)], key=judge)
-            if better == best:
-                break
-            best = better
+        best = _best_stepwise(judge, score, kinds)
     good = [faults for faults, value in score.items() if value > score[best] - DISTINCT_LOG_ODDS]
     return _conclude(best, good, len(sensors) + n_others)
 
@@ -343,11 +340,52 @@ def _conclude(best: Faults, good: list[Faults], n_sensors: int) -> _Explanation:
     return _Explanation(sure, disagreeing, len(good) == 1, undecided, best)
 
 
-def _neighbouring_sets(faults: Faults, kinds: list[list[tuple[int, str]]]) -> list[Faults]:
-    """Return the sets with one fault added, removed or exchanged; at most one fault per sensor."""
+def _best_stepwise(
+    judge: Callable[[Faults], float], score: dict[Faults, float], kinds: list[list[tuple[int, str]]]
+) -> Faults:
+    """Return the best set of faults of those that a stepwise search finds; `judge` enters them in
+    `score`.
+
+    Other sensors may explain the lines as well: half of some that see no others may be wrong,
+    either half. No step leads from one half to the other. So for each sensor of the best set, the
+    best set without a fault of that sensor is searched too.
+    """
+    best: Faults = frozenset()
+    while True:
+        best = _climb(judge, best, partial(_neighbouring_sets, kinds=kinds))
+        for sensor in sorted({s for s, _ in best}):
+            others = [of_sensor for of_sensor in kinds if of_sensor[0][0] != sensor]
+            rest = frozenset(fault for fault in best if fault[0] != sensor)
+            _climb(judge, rest, partial(_one_more_or_less, kinds=others))
+        better = max(score, key=judge)
+        if judge(better) <= judge(best):
+            return best
+        best = better
+
+
+def _climb(
+    judge: Callable[[Faults], float], start: Faults, next_to: Callable[[Faults], list[Faults]]
+) -> Faults:
+    """Return the set that a search from `start` ends at: each step goes to the best set next."""
+    best = start
+    while True:
+        better = max([best, *next_to(best)], key=judge)
+        if better == best:
+            return best
+        best = better
+
+
+def _one_more_or_less(faults: Faults, kinds: list[list[tuple[int, str]]]) -> list[Faults]:
+    """Return the sets with one fault added or removed; at most one fault per sensor."""
     sensors = {s for s, _ in faults}
     possible = [fault for of_sensor in kinds for fault in of_sensor]
     more = [faults | {fault} for fault in possible if fault[0] not in sensors]
+    return [*more, *(faults - {fault} for fault in sorted(faults))]
+
+
+def _neighbouring_sets(faults: Faults, kinds: list[list[tuple[int, str]]]) -> list[Faults]:
+    """Return the sets with one fault added, removed or exchanged; at most one fault per sensor."""
+    possible = [fault for of_sensor in kinds for fault in of_sensor]
     less = [faults - {fault} for fault in sorted(faults)]
     exchanged = [
         fewer | {fault}
@@ -355,7 +393,7 @@ def _neighbouring_sets(faults: Faults, kinds: list[list[tuple[int, str]]]) -> li
         for fault in possible
         if fault not in faults and fault[0] not in {s for s, _ in fewer}
     ]
-    return [*more, *less, *exchanged]
+    return [*_one_more_or_less(faults, kinds), *exchanged]
 
 
 def _judged(model: Model, explained: _Explanation, has_lines: Flags) -> JudgedSensors:

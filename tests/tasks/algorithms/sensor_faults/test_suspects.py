@@ -79,6 +79,26 @@ def test_pairs_of_which_one_is_wrong_disagree_where_many_others_agree(n_pairs):
     assert not found.doubt.undecided
 
 
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_of_four_that_see_no_others_two_are_wrong_alike_and_all_four_disagree(seed):
+    """The errors of either two explain the lines as well; no single step leads from one set of
+    faults to the other."""
+    n = 10
+    lines = lines_of_many(seed, n, 600, off_km={0: 8.0, 1: 8.0}, seen_share=0.7)
+    of_four = lines.sensor < 4
+    kept = np.where(lines.group % 2 == 0, of_four, ~of_four)
+    lines = lines._replace(**{name: getattr(lines, name)[kept] for name in lines._fields})
+    found = judged(lines, n)
+    assert faults(found) == dict.fromkeys(range(4), DISAGREES)
+    assert not found.doubt.undecided
+
+
+def test_of_eight_four_are_wrong_alike_and_it_is_undecided_which():
+    found = judged(lines_of_many(1, 8, 200, off_km=dict.fromkeys(range(4), 8.0)), 8)
+    assert faults(found) == {}
+    assert found.doubt.undecided
+
+
 @pytest.mark.long
 def test_of_a_hundred_sensors_no_sound_one_is_at_fault_and_offsets_are_honest():
     scores = []
