@@ -77,6 +77,9 @@ def judge_many_sensors(
             len(np.setdiff1d(left.sensor, together)),
         )
         newly = _store_judged(found, judged, together)
+        # The sensors with most lines may be clear, and others not.
+        undecided = doubt.undecided or judged.doubt.undecided
+        found = found._replace(doubt=doubt._replace(undecided=undecided))
         if not newly:
             break
         faulty[newly] = True

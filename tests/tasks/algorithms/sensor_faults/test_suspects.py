@@ -63,20 +63,33 @@ def test_two_of_many_of_which_one_is_wrong_disagree_both():
     assert not found.doubt.undecided
 
 
-@pytest.mark.parametrize("n_pairs", [5, 8])
-def test_pairs_of_which_one_is_wrong_disagree_where_many_others_agree(n_pairs):
-    """Nearly all that are judged together are of such pairs."""
-    n_sound = MAX_TOGETHER
+def with_pairs(n_sound, n_pairs, n_groups):
+    """Return lines of sensors that agree, and of pairs that see objects with each other alone, of
+    each of which one is wrong."""
     n = n_sound + 2 * n_pairs
     off_km = {n_sound + 2 * k: 8.0 for k in range(n_pairs)}
-    lines = lines_of_many(3, n, 600, off_km=off_km, seen_share=0.7)
+    lines = lines_of_many(3, n, n_groups, off_km=off_km, seen_share=0.7)
     of_pair = np.where(lines.sensor < n_sound, -1, (lines.sensor - n_sound) // 2)
     turn = np.where(lines.group % 2 == 0, -1, lines.group // 2 % n_pairs)
     kept = of_pair == turn  # those that agree have the even groups
-    lines = lines._replace(**{name: getattr(lines, name)[kept] for name in lines._fields})
-    found = judged(lines, n)
-    assert faults(found) == dict.fromkeys(range(n_sound, n), DISAGREES)
+    return lines._replace(**{name: getattr(lines, name)[kept] for name in lines._fields})
+
+
+@pytest.mark.parametrize("n_pairs", [5, 8])
+def test_pairs_of_which_one_is_wrong_disagree_where_many_others_agree(n_pairs):
+    """Nearly all that are judged together are of such pairs."""
+    n = MAX_TOGETHER + 2 * n_pairs
+    found = judged(with_pairs(MAX_TOGETHER, n_pairs, 600), n)
+    assert faults(found) == dict.fromkeys(range(MAX_TOGETHER, n), DISAGREES)
     assert not found.doubt.undecided
+
+
+def test_it_is_undecided_who_is_wrong_where_fewer_agree_than_not():
+    """Of the sensors with the most lines more agree than not: the pairs have few."""
+    n_sound, n_pairs = 13, 9
+    found = judged(with_pairs(n_sound, n_pairs, 700), n_sound + 2 * n_pairs)
+    assert faults(found) == {}
+    assert found.doubt.undecided
 
 
 @pytest.mark.parametrize("seed", [1, 2, 3])
