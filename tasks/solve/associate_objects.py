@@ -133,7 +133,7 @@ def _associate_windows(
     for sampled, window in _sampled_windows(block, range(len(windows)), max_views):
         instants, rows = block.instants[window], windows[window]
         samples, tracklet = sampled.samples(instants, np.zeros(0, np.int64))
-        groups = _find_groups(block, samples, settings)
+        groups = _find_groups(block, instants, samples, settings)
         agreed = agreement(samples, groups)
         judged[window] = agreed.judged
         disagrees[window, agreed.disagreeing()] = True
@@ -148,8 +148,10 @@ def _associate_windows(
         rows = np.setdiff1d(rows, left_out[window])
         if len(rows):
             without = np.flatnonzero(disagrees[window] | mostly)
-            samples, tracklet = sampled.samples(block.instants[window], without)
-            window_groups.enter(rows, tracklet, _find_groups(block, samples, settings))
+            instants = block.instants[window]
+            samples, tracklet = sampled.samples(instants, without)
+            groups = _find_groups(block, instants, samples, settings)
+            window_groups.enter(rows, tracklet, groups)
     return [rows for rows in left_out if len(rows)]
 
 
@@ -181,8 +183,9 @@ def _associate_longer(
             rows = np.flatnonzero((longer == number) & agreeing)
             again = window_groups.to_decide_again(rows, window_before_s)
             if len(again):
-                samples, tracklet = _long_samples(block, rows, number, window_s)
-                groups = _find_groups(block, samples, settings)
+                instants = _long_instants(block, number, window_s)
+                samples, tracklet = _long_samples(block, rows, instants)
+                groups = _find_groups(block, instants, samples, settings)
                 window_groups.reconsider(rows, again, tracklet, groups)
         window_before_s = window_s
     window_groups.withdraw(window_groups.contradicted(BRIEFLY * settings.window_s))
@@ -199,16 +202,17 @@ def _changing(block: BlockViews, group: Indices, windows: list[Indices]) -> Indi
     return np.flatnonzero((number >= 0) & ~_in_main(items.tracklet, number, items.n_views))
 
 
-def _long_samples(
-    block: BlockViews, rows: Indices, number: int, window_s: float
-) -> tuple[Samples, Indices]:
+def _long_instants(block: BlockViews, number: int, window_s: float) -> Indices:
+    """Return the instants of a longer window."""
+    width_ns = round(window_s * 1e9)
+    return even_instants(block.epochs[block.epochs // width_ns == number], block.half_width_s)
+
+
+def _long_samples(block: BlockViews, rows: Indices, instants: Indices) -> tuple[Samples, Indices]:
     """Return the samples of the items of a longer window, and their tracklets.
 
     Sensors that were left out in a part of the window take part with their other views.
     """
-    width_ns = round(window_s * 1e9)
-    epochs = block.epochs[block.epochs // width_ns == number]
-    instants = even_instants(epochs, block.half_width_s)
     sampled = SampledViews(block, instants, agreeing_items=rows)
     return sampled.samples(instants, np.zeros(0, np.int64))
 
@@ -253,9 +257,11 @@ def _in_main(track: Indices, number: Indices, n_views: Indices) -> Flags:
     return out
 
 
-def _find_groups(block: BlockViews, samples: Samples, settings: AssociationSettings) -> Groups:
+def _find_groups(
+    block: BlockViews, instants: Indices, samples: Samples, settings: AssociationSettings
+) -> Groups:
     associate = load_method(ASSOCIATION, settings.method)
-    groups: Groups = associate(samples, block.poses.focal_px, settings)
+    groups: Groups = associate(samples, block.poses.fields_at(instants).focal_px, settings)
     return groups
 
 

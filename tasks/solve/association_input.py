@@ -109,6 +109,14 @@ class Poses(NamedTuple):
     sensor_km_s: Array
 
 
+class Fields(NamedTuple):
+    """Fields of s sensors: tangents of half the width and height, (s, 2), and focal lengths [px],
+    (s,)."""
+
+    half_field: Array
+    focal_px: Array
+
+
 class SensorPoses:
     """The poses of sensors at their epochs, and their fields.
 
@@ -122,15 +130,23 @@ class SensorPoses:
 
     def __init__(self, epochs: Sequence[pa.Table], cameras: Sequence[pa.Table]) -> None:
         self._frames = [_near_frames(rows) for rows in epochs]
-        half_field, focal_px = [], []
-        for rows, of_sensor in zip(epochs, cameras, strict=True):
-            camera = camera_of(of_sensor, int(array(rows, "camera")[0]) if rows.num_rows else 0)
-            half_field.append(
-                (camera.width / camera.fx_px / 2, camera.height / abs(camera.fy_px) / 2)
-            )
-            focal_px.append(camera.fx_px)
-        self.half_field = np.array(half_field, float).reshape(-1, 2)
-        self.focal_px = np.array(focal_px, float)
+        self._epoch_ns = [array(rows, "epoch") for rows in epochs]
+        self._camera = [array(rows, "camera") for rows in epochs]
+        self._fields = [_fields_of(of_sensor) for of_sensor in cameras]
+
+    def fields_at(self, instants: Indices) -> Fields:
+        """Return the fields of a window: by the cameras at the middle one of its instants.
+
+        A sensor without an epoch there has the camera of the epoch before, or of its first one.
+        """
+        middle = instants[len(instants) // 2] if len(instants) else 0
+        rows = []
+        for epoch_ns, camera in zip(self._epoch_ns, self._camera, strict=True):
+            at = max(int(np.searchsorted(epoch_ns, middle, side="right")) - 1, 0)
+            rows.append(int(camera[at]) if len(camera) else 0)
+        chosen = [fields[row] for fields, row in zip(self._fields, rows, strict=True)]
+        half_width, half_height, focal_px = np.reshape(np.array(chosen, float), (-1, 3)).T
+        return Fields(np.column_stack([half_width, half_height]), focal_px)
 
     def at(self, instants: Indices) -> Poses:
         """Return the poses at some epochs."""
@@ -146,6 +162,12 @@ class SensorPoses:
             q[s, there], r_km[s, there] = frames.q[at[there]], frames.r_km[at[there]]
             velocity[s, there] = frames.v_km_s[at[there]]
         return Poses(matrix_from_quaternion(q), r_km, velocity)
+
+
+def _fields_of(cameras: pa.Table) -> list[tuple[float, float, float]]:
+    """Return tangents of half the width and height, and the focal length [px], of each camera."""
+    every = (camera_of(cameras, row) for row in range(cameras.num_rows))
+    return [(c.width / c.fx_px / 2, c.height / abs(c.fy_px) / 2, c.fx_px) for c in every]
 
 
 class _Frames(NamedTuple):
@@ -407,7 +429,7 @@ class SampledViews:
             repeated[:, None, None] * self.noise[rows] + n_samples[:, None, None] * self.bias[rows]
         )
         sigma_km[item, at] = np.sqrt(n_samples) * self.sigma_km[rows]
-        poses = self.block.poses.at(instants)
+        poses, fields = self.block.poses.at(instants), self.block.poses.fields_at(instants)
         sensor_km = poses.sensor_km.copy()
         sensor = self.block.sensor_of_tracklet[tracklet].astype(np.int64)
         sensor_km[sensor[item], at] = self.r_km[rows]
@@ -423,11 +445,11 @@ class SampledViews:
             time_s=(instants - origin) / 1e9,
             sensor_km=sensor_km,
             R_sensor_from_icrs=poses.R_sensor_from_icrs,
-            half_field=self.block.poses.half_field,
+            half_field=fields.half_field,
             rate=rate,
             sensor_km_s=poses.sensor_km_s,
             magnitude=_means(self.magnitude[rows], item, t),
-            blend_rad=BLEND_PX / self.block.poses.focal_px,
+            blend_rad=BLEND_PX / fields.focal_px,
         ), tracklet
 
 
