@@ -44,15 +44,19 @@ def seeds_between(space, a, b, gate_sigma):
         items_b, angle_b, sigma_b = items_b[order], angle_b[order], sigma_b[order]
         max_sigma = sigma_b.max()
         for q in range(len(items_a)):
-            reach = gate * np.sqrt(sigma_a[q] ** 2 + max_sigma**2)
-            k = np.searchsorted(angle_b, angle_a[q] - reach)
-            while k < len(items_b) and angle_b[k] <= angle_a[q] + reach:
-                if meet(space, items_a[q], items_b[k], m, gate_sigma, axes):
-                    if n == len(out):
-                        out = doubled(out, n)
-                    out[n, 0], out[n, 1] = items_a[q], items_b[k]
-                    n += 1
-                k += 1
+            reach = min(gate * np.sqrt(sigma_a[q] ** 2 + max_sigma**2), np.pi)
+            for turn in range(-1, 2):  # angles near half a turn have neighbours on its other side
+                angle = angle_a[q] + turn * 2 * np.pi
+                if abs(angle) - reach > np.pi:
+                    continue
+                k = np.searchsorted(angle_b, angle - reach)
+                while k < len(items_b) and angle_b[k] <= angle + reach:
+                    if meet(space, items_a[q], items_b[k], m, gate_sigma, axes):
+                        if n == len(out):
+                            out = doubled(out, n)
+                        out[n, 0], out[n, 1] = items_a[q], items_b[k]
+                        n += 1
+                    k += 1
     return out[:n]
 
 

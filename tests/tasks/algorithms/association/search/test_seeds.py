@@ -11,7 +11,10 @@ from scenes.ten_tracklets import (
     ten_tracklets,
 )
 
+from epipole.tasks.algorithms.association.samples import Samples
 from epipole.tasks.algorithms.association.search.seeds import seeds_between
+from epipole.tasks.algorithms.constants import ARCSEC
+from epipole.tasks.algorithms.geometry.directions import tangent_basis
 
 SCENES = [
     {"n_objects": 6, "spread_km": 40.0},
@@ -71,6 +74,43 @@ def test_angles_of_precise_sensors_leave_out_no_pair_whose_lines_meet(gate_sigma
             sure, _ = of_all_pairs(scene, a, b, gate_sigma)
             seeds = seeds_between(scene.space, a, b, gate_sigma)
             assert sure <= set(map(tuple, seeds.tolist()))
+
+
+def astride_the_baseline(n):
+    """Return a scene of two sensors, one in the other's field: n objects on the far side of the
+    baseline, opposite the middle of the field, and twice as many around that."""
+    rng = np.random.default_rng(1)
+    toward, side = np.array([0.8, 0.6, 0.0]), np.array([[-0.6, 0.8, 0.0], [0.0, 0.0, 1.0]])
+    r = np.array([7000.0, 0.0, 0.0]) + np.array([[0.0], [500.0]]) * toward
+    far = np.pi + rng.uniform(-3e-3, 3e-3, n)
+    near = rng.uniform(-0.3, 0.3, n)
+    turn = np.concatenate([far, near, -near])
+    off = np.radians(np.append(rng.uniform(1.0, 3.0, n), rng.uniform(6.0, 12.0, 2 * n)))[:, None]
+    u = np.cos(off) * toward + np.sin(off) * (np.column_stack([np.cos(turn), np.sin(turn)]) @ side)
+    x = r[0] + rng.uniform(2000.0, 4000.0, 3 * n)[:, None] * u
+    u = np.concatenate([x - each for each in r])
+    u /= np.linalg.norm(u, axis=1, keepdims=True)
+    t, sigma = len(u), 4 * ARCSEC
+    u += np.einsum("na,nai->ni", rng.normal(0.0, sigma, (t, 2)), tangent_basis(u))
+    samples = Samples(
+        sensor=np.repeat([0, 1], 3 * n), start_s=np.zeros(t), end_s=np.zeros(t),
+        seen=np.ones((t, 1), bool), u=(u / np.linalg.norm(u, axis=1, keepdims=True))[:, None],
+        cov=np.tile(np.eye(2) * sigma**2, (t, 1, 1, 1)), sigma_km=np.full((t, 1), 0.001),
+        time_s=np.zeros(1), sensor_km=r[:, None],
+        R_sensor_from_icrs=np.full((2, 1, 3, 3), np.nan), half_field=np.full((2, 2), 0.3),
+    )  # fmt: skip
+    return scene_of(samples, np.tile(np.arange(3 * n), 2), rng)
+
+
+def test_angles_on_both_sides_of_half_a_turn_are_neighbours():
+    scene = astride_the_baseline(20)
+    for a, b in [(0, 1), (1, 0)]:
+        sure, verge = of_all_pairs(scene, a, b, GATE_SIGMA)
+        same = {(i, j) for i, j in sure if scene.who[i] == scene.who[j]}
+        assert len(same) >= 55
+        seeds = list(map(tuple, seeds_between(scene.space, a, b, GATE_SIGMA).tolist()))
+        assert len(set(seeds)) == len(seeds)
+        assert sure <= set(seeds) <= sure | verge
 
 
 def test_sensors_at_one_position_have_no_seeds():
