@@ -1,15 +1,26 @@
 """Correct a clock: set one sensor's identified frames of a span to their true times."""
 
+from collections.abc import Mapping
+
 import numpy as np
 import pyarrow as pa
 
 from epipole.io.work.parts import IDENTIFIED, Parts, write_part
 from epipole.io.work.work_layout import ReadFolder
-from epipole.schemas.bridge import array, from_polars, to_polars
+from epipole.schemas.arrays import Array, Flags
+from epipole.schemas.bridge import array, from_polars, nullable, stack, table, to_polars, unstack
 from epipole.schemas.settings import SensorSettings
 from epipole.schemas.spans import Sensor, Span
 from epipole.schemas.stages import Stage
+from epipole.schemas.tables import DETECTIONS
 from epipole.schemas.work_tables import SOLUTIONS
+from epipole.tasks.algorithms.geometry.directions import (
+    boresight_angles,
+    matrix_from_quaternion,
+    quaternion_from_matrix,
+    radec_from_unit,
+    unit_from_radec,
+)
 from epipole.tasks.check.check_sensors import SensorVerdict
 from epipole.tasks.common.stage_tasks import stage_task
 from epipole.tasks.identify.frame_inputs import interpolate_sensor_states
@@ -20,6 +31,7 @@ STATE_COLUMNS = [
     *("vx_km_s", "vy_km_s", "vz_km_s"),
     *("position_sigma_km", "used_position_sigma_km"),
 ]
+BORESIGHT = ("ra_deg", "dec_deg", "roll_deg")
 
 
 @stage_task(Stage.CHECK, "{sensor} {span}")
@@ -48,6 +60,7 @@ def correct_clock(
     states = states_about(frames, sensor, span, settings.state_gap_s)
     at_frames = interpolate_sensor_states(tables["solutions"], states, settings)
     tables["solutions"] = with_sensor_states(tables["solutions"], at_frames)
+    tables |= with_prior_attitudes(tables["solutions"], tables["detections"], at_frames)
     tables["rejects"] = identified.read(span, "rejects")
     write_part(parts.of(span), IDENTIFIED, tables)
 
@@ -68,3 +81,51 @@ def with_sensor_states(solutions: pa.Table, at_frames: pa.Table) -> pa.Table:
         states, on=key, how="left", maintain_order="left"
     )  # fmt: skip
     return from_polars(SOLUTIONS, moved)
+
+
+def with_prior_attitudes(
+    solutions: pa.Table, detections: pa.Table, at_frames: pa.Table
+) -> dict[str, pa.Table]:
+    """Return the solutions and detections, with the prior attitudes that `at_frames` has.
+
+    A sensor that turns had another attitude at the true time. Attitudes from stars stay: they are
+    those of the exposure. So do prior ones where the states have none at the true time.
+
+    Parameters
+    ----------
+    at_frames
+        SENSOR_STATES_AT_FRAMES, in the order of the solutions.
+    """
+    q_then = stack(at_frames, "q{}", "xyzw")
+    moved = (array(solutions, "attitude_source") == "prior") & np.isfinite(q_then[:, 3])
+    if not moved.any():
+        return {"solutions": solutions, "detections": detections}
+    q = stack(solutions, "q{}", "xyzw")
+    R, R_then = matrix_from_quaternion(q), matrix_from_quaternion(q_then)
+    q[moved] = quaternion_from_matrix(R_then[moved])
+    angles = np.stack([array(solutions, name) for name in BORESIGHT])
+    angles[:, moved] = np.degrees(boresight_angles(R_then[moved]))
+    columns = {**unstack("q{}", q, "xyzw"), **dict(zip(BORESIGHT, angles, strict=True))}
+    return {
+        "solutions": _replaced(SOLUTIONS, solutions, columns),
+        "detections": _turned(detections, solutions, np.swapaxes(R_then, 1, 2) @ R, moved),
+    }
+
+
+def _turned(detections: pa.Table, solutions: pa.Table, turn: Array, moved: Flags) -> pa.Table:
+    """Return the detections with the directions of some frames, (f,) bool, turned by (f, 3, 3)."""
+    numbers = array(solutions, "frame_number")
+    order = np.argsort(numbers, kind="stable")
+    frame = order[np.searchsorted(numbers[order], array(detections, "frame_number"))]
+    rows = np.flatnonzero(moved[frame])
+    ra_deg, dec_deg = (array(detections, name).copy() for name in ("ra_deg", "dec_deg"))
+    u = unit_from_radec(np.radians(ra_deg[rows]), np.radians(dec_deg[rows]))
+    ra, dec = radec_from_unit(np.einsum("nij,nj->ni", turn[frame[rows]], u))
+    ra_deg[rows], dec_deg[rows] = np.degrees(ra), np.degrees(dec)
+    return _replaced(DETECTIONS, detections, {"ra_deg": ra_deg, "dec_deg": dec_deg})
+
+
+def _replaced(schema: pa.Schema, rows: pa.Table, columns: Mapping[str, Array]) -> pa.Table:
+    """Return rows of a schema with other values in some columns; NaN is null."""
+    kept = {name: rows[name] for name in schema.names}
+    return table(schema, kept | {name: nullable(values) for name, values in columns.items()})
