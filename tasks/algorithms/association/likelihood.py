@@ -179,7 +179,9 @@ class _Search:
             self._take_leftover(pairs.ranked)
         nothing_taken = self.space._replace(taken=np.zeros_like(self.space.taken))
         x_km = np.array([h.x_km for h in self.groups]).reshape(-1, 3)
+        grouped = self.group != FREE
         resolve_conflicts(nothing_taken, self.work, self.group, x_km)
+        self.ambiguous |= grouped & (self.group == FREE)  # two objects explain them as well
         scores = self._withdraw_doubtful(min_log_odds)
         group, ambiguous = np.empty_like(self.group), np.empty_like(self.ambiguous)
         free, undecided = self.group == FREE, np.empty_like(self.ambiguous)

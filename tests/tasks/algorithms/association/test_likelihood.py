@@ -84,6 +84,18 @@ def test_two_objects_that_two_sensors_cannot_tell_apart_are_ambiguous(magnitude)
     assert (groups.group == -1).all()
 
 
+def test_tracklets_that_go_to_neither_of_two_near_objects_are_ambiguous():
+    """Objects 1 km apart, of which eight sensors with 4 arcsec cannot tell all tracklets."""
+    n_ambiguous = n_undecided = 0
+    for seed in range(3):
+        scene = Scene(seed, 8, sigma_arcsec=4.0, times=np.array([15.0])).objects(8, spread_km=1.0)
+        found = solve(scene.samples())
+        n_ambiguous += found.ambiguous.sum()
+        n_undecided += found.undecided.sum()
+    assert n_ambiguous >= 40
+    assert n_undecided < n_ambiguous / 4
+
+
 @pytest.mark.parametrize("seen_as", [[7.0, 7.1, 9.1, 9.0], [9.1, 9.0, 7.0, 7.1]])
 def test_magnitudes_tell_two_objects_apart_that_directions_do_not(seen_as):
     """The sensors are 11 degrees apart as seen from there, and agree to 0.1 mag."""
