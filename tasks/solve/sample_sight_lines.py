@@ -29,8 +29,8 @@ from epipole.tasks.solve.view_groups import ObjectViews, ViewGroups
 
 
 class LineSampling(NamedTuple):
-    """Which lines of sight are kept: one in `one_in` of those at epochs that are multiples of
-    `every_ns` since midnight."""
+    """Which lines of sight are kept: those of one in `one_in` objects, at epochs that are multiples
+    of `every_ns` since midnight."""
 
     every_ns: int
     one_in: int = 1
@@ -61,8 +61,9 @@ def object_views(views: ObjectViews, objects: pa.Table) -> pa.Table:
 def sample_sight_lines(groups: ViewGroups, objects: pa.Table, sampling: LineSampling) -> pa.Table:
     """Return CLOCK_LINES: views of objects at the epochs of MOVING_OBJECTS.
 
-    If only some are kept, the choice changes from epoch to epoch and from object to object. So each
-    sensor keeps lines at many epochs: all lines of a frame share the error of its attitude.
+    If only some are kept, they are those of other objects at each epoch. So each sensor keeps lines
+    at many epochs: all lines of a frame share the error of its attitude. Of an object at an epoch
+    all lines are kept or none: a line that is left alone shows nothing.
     """
     rows = _at_epochs(groups.views, objects)
     rows = rows[_phase(groups, rows, sampling) == 0]
@@ -93,17 +94,18 @@ def _at_epochs(views: ObjectViews, objects: pa.Table) -> Indices:
 
 
 def _phase(groups: ViewGroups, rows: Indices, sampling: LineSampling) -> Indices:
-    """Return a number below `one_in` for each view, spread evenly over sensors and objects."""
-    sensors = groups.views.sensor_ids[groups.views.sensor[rows]]
-    numbers = [_checksums(sensors), _checksums(groups.object_id[groups.group[rows]])]
-    epoch = groups.views.epoch_ns[rows] // sampling.every_ns
-    return np.asarray((numbers[0] + numbers[1] + epoch) % sampling.one_in)
+    """Return a number below `one_in` for each view, the same for all of an object at an epoch."""
+    objects = _checksums(groups.object_id[groups.group[rows]])
+    # As if at random: a long night is judged at every second epoch, or every eighth. Numbers that
+    # count up would give the same objects there, and others never.
+    epochs = _checksums(groups.views.epoch_ns[rows] // sampling.every_ns)
+    return np.asarray((objects + epochs) % sampling.one_in)
 
 
-def _checksums(texts: npt.NDArray[Any]) -> Indices:
-    """Return the CRC-32 of each text."""
-    distinct, which = np.unique(texts.astype(np.str_), return_inverse=True)
-    return np.array([zlib.crc32(text.encode()) for text in distinct.tolist()], np.int64)[which]
+def _checksums(values: npt.NDArray[Any]) -> Indices:
+    """Return the CRC-32 of each value as a text."""
+    distinct, which = np.unique(values, return_inverse=True)
+    return np.array([zlib.crc32(str(value).encode()) for value in distinct], np.int64)[which]
 
 
 def pair_with_objects(views: pl.DataFrame, objects: pl.DataFrame, on: list[str]) -> pa.Table:

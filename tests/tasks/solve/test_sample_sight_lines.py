@@ -20,7 +20,7 @@ from epipole.tasks.solve.sample_sight_lines import (
 from epipole.tasks.solve.view_groups import ViewGroups, unpack_views
 
 EVERY_NS = 10_000_000_000
-N_EPOCHS, N_OBJECTS, N_SENSORS = 20, 12, 30
+N_EPOCHS, N_OBJECTS, N_SENSORS = 320, 12, 10
 
 
 @pytest.fixture(scope="module")
@@ -70,3 +70,22 @@ def test_of_fewer_lines_each_sensor_has_many_epochs_and_each_object_two_sensors(
     assert len(per_sensor) == N_SENSORS
     assert per_sensor["epoch"].min() >= N_EPOCHS // 2 - 2
     assert lines.group_by("epoch", "object_id").len()["len"].min() >= 2
+
+
+@pytest.mark.parametrize("one_in", [2, 4, 7])
+def test_of_an_object_at_an_epoch_the_lines_of_all_sensors_are_kept_or_none(kept_lines, one_in):
+    """Each two sensors are compared, whatever their names."""
+    lines = kept_lines(one_in)
+    assert set(lines.group_by("epoch", "object_id").len()["len"]) == {N_SENSORS}
+    assert lines["object_id"].n_unique() == N_OBJECTS
+
+
+@pytest.mark.parametrize(("one_in", "stride"), [(2, 2), (2, 6), (4, 4), (4, 8), (6, 3)])
+def test_every_object_has_lines_at_some_of_the_epochs_that_a_night_is_judged_at(
+    kept_lines, one_in, stride
+):
+    """A long night is judged at each of some epochs that lie evenly among those with lines."""
+    lines = kept_lines(one_in)
+    epochs = lines["epoch"].unique().sort()[::stride]
+    judged = lines.filter(pl.col("epoch").is_in(epochs.implode()))
+    assert judged["object_id"].n_unique() == N_OBJECTS
