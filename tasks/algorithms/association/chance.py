@@ -59,8 +59,8 @@ class Chance(NamedTuple):
     spread : (s,) float
         Spread of their rates, 1-sigma per axis [rad/s].
     objects_in_view, objects_km3 : float
-        Assumed number of objects in a field: the median number of tracklets of a sensor; and the
-        same per km^3 of a field.
+        Assumed number of objects in a field: the median number of tracklets of a sensor that has
+        any; and the same per km^3 of a field.
     detected : (s,) float
         Probability that a sensor detects an object in its field.
     """
@@ -94,8 +94,10 @@ def chance_of(samples: Samples, farthest_km: float, detected: float) -> Chance:
             # The median of a single rate is that rate, not the usual one.
             drift[s] = np.median(rates, axis=0) * (1 - 1 / max(weight.sum(), 1.0))
         spread[s] = _spread(rates - drift[s], weight)
-    volume = float(np.median(samples.field_sr)) * farthest_km**3 / 3
-    objects = max(float(np.median(count)), 1.0)
+    # Sensors without any tracklet do not count: rows do not depend on who looks elsewhere.
+    seeing = count > 0 if count.any() else np.ones(n_sensors, bool)
+    volume = float(np.median(samples.field_sr[seeing])) * farthest_km**3 / 3
+    objects = max(float(np.median(count[seeing])), 1.0)
     return Chance(density, drift, spread, objects, objects / volume, np.full(n_sensors, detected))
 
 

@@ -3,6 +3,8 @@
 import numpy as np
 import pytest
 from scenes.many_sensors import circular
+from scenes.tracklet_scenes import Scene
+from scenes.tracklet_scenes import solve as solve_scene
 
 from epipole.schemas.settings import AssociationSettings
 from epipole.tasks.algorithms.association.samples import Samples
@@ -87,3 +89,31 @@ def test_two_sensors_find_their_object_among_any_number_of_others(seed):
     assert alone.sum() >= N_PAIRS - 1
     for n_strangers in (60, 1500):
         assert (found(solve(scene(seed, n_strangers))) >= alone).all()
+
+
+def with_idle(samples, n):
+    """Return the samples with n more sensors without a tracklet, which look away from the rest."""
+    k, away = samples.seen.shape[1], np.array([1.0, 0.0, 0.0])
+    r = np.array([7000.0, 500.0, 0.0]) + 30.0 * np.arange(n)[:, None] * [0.0, 1.0, 0.0]
+    R = np.concatenate([tangent_basis(away), away[None]])
+    return samples._replace(
+        sensor_km=np.concatenate([samples.sensor_km, np.tile(r[:, None], (1, k, 1))]),
+        R_sensor_from_icrs=np.concatenate(
+            [samples.R_sensor_from_icrs, np.tile(R, (n, k, 1, 1))]
+        ),
+        half_field=np.concatenate([samples.half_field, np.full((n, 2), 0.01)]),
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize("n_idle", [1, 3, 4])
+def test_sensors_that_see_nothing_change_nothing(n_idle):
+    """Of two sensors among many strays, few groups are certain: each part of the odds counts."""
+    n_found = 0
+    for seed in range(4):
+        samples = Scene(seed, 2, sigma_arcsec=2.0).objects(20).strays(100).samples()
+        alone, among = solve_scene(samples), solve_scene(with_idle(samples, n_idle))
+        np.testing.assert_array_equal(among.group, alone.group)
+        np.testing.assert_allclose(among.score, alone.score, rtol=1e-12)
+        np.testing.assert_array_equal(among.ambiguous, alone.ambiguous)
+        n_found += len(alone.score)
+    assert n_found > 10
