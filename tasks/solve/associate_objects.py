@@ -177,7 +177,7 @@ def _associate_longer(
         if not window_before_s < window_s <= settings.max_window_s:
             continue
         window_groups.doubt(_changing(block, window_groups.group, windows))
-        window_groups.doubt(window_groups.contradicted(BRIEFLY * settings.window_s))
+        window_groups.doubt(window_groups.contradicted(agreeing, BRIEFLY * settings.window_s))
         longer = block.items.first_ns // round(window_s * 1e9)
         for number in np.unique(longer[agreeing]).tolist():
             rows = np.flatnonzero((longer == number) & agreeing)
@@ -188,7 +188,7 @@ def _associate_longer(
                 groups = _find_groups(block, instants, samples, settings)
                 window_groups.reconsider(rows, again, tracklet, groups)
         window_before_s = window_s
-    window_groups.withdraw(window_groups.contradicted(BRIEFLY * settings.window_s))
+    window_groups.withdraw(window_groups.contradicted(agreeing, BRIEFLY * settings.window_s))
 
 
 def _changing(block: BlockViews, group: Indices, windows: list[Indices]) -> Indices:

@@ -70,14 +70,15 @@ class WindowGroups:
         groups = self.group[rows]
         self._score[groups[groups != FREE]] = -np.inf
 
-    def contradicted(self, briefly_s: float) -> Indices:
+    def contradicted(self, compared: Flags, briefly_s: float) -> Indices:
         """Return the items of groups of two tracklets that fit no object in another window.
 
-        There both are seen for longer than `briefly_s` [s]. Two sensors and two objects in nearly
-        one plane may agree by far in one half minute, and not at all in the next.
+        There both are seen for longer than `briefly_s` [s], and `compared` (n,) bool: not those of
+        sensors that are left out. Two sensors and two objects in nearly one plane may agree by far
+        in one half minute, and not at all in the next.
         """
         items = self.items
-        alone = (self.group == FREE) & ~self.undecided & ~self.ambiguous
+        alone = (self.group == FREE) & ~self.undecided & ~self.ambiguous & compared
         alone = np.flatnonzero(alone & (items.last_ns - items.first_ns > briefly_s * 1e9))
         alone = alone[np.argsort(items.tracklet[alone], kind="stable")]
         tracklet, window = items.tracklet[alone], items.window[alone]

@@ -80,6 +80,23 @@ def test_a_clock_a_second_off_gives_no_wrong_object():
     assert wrong_views(scene, associated(scene)) == 0
 
 
+@pytest.mark.parametrize(("end_s", "max_window_s"), [(118.0, 0.0), (88.0, 600.0)])
+def test_a_sensor_that_disagrees_in_one_window_keeps_its_objects_in_the_others(end_s, max_window_s):
+    """Also those that it sees with one other sensor."""
+    scene = Scene(1, 3, times=np.arange(30.0, end_s, 4.0)).objects(8, spread_km=100.0)
+    scene.objects(4, spread_km=100.0, seen_by=[0, 2])
+    turned = scene.times < 60.0
+    for i, s in enumerate(scene.sensor):
+        if s == 2:  # by 0.3 degree, until 60 s
+            scene.u[i][turned] += np.cross([0.0, 0.0, 1.0], scene.u[i][turned]) * np.radians(0.3)
+            scene.u[i] /= np.linalg.norm(scene.u[i], axis=1, keepdims=True)
+    found = associated(scene, max_window_s=max_window_s)
+    assert reasons(found) == {"sensor_disagrees": 12}
+    ids = np.array(found.views["tracklet_id"].to_pylist())
+    of_pairs = np.isin(ids, [f"t{i:04d}" for i in range(24, 32)])
+    assert of_pairs.sum() >= 0.95 * 8 * (~turned).sum()
+
+
 def test_two_sensors_with_one_id_give_no_wrong_object():
     scene = Scene(19, 4).objects(6, spread_km=100.0)
     found = associated(scene, ["sat0", "sat1", "sat2", "sat2"])

@@ -177,7 +177,16 @@ def test_a_group_of_two_that_fits_no_object_in_another_window_is_contradicted(
     items.last_ns[2:] -= np.where(np.isin(items.tracklet[2:], brief), 16_000_000_000, 0)
     if state:
         getattr(verdicts, state)[2:] = True
-    assert verdicts.contradicted(BRIEFLY_S).tolist() == ([0, 1] if doubted else [])
+    every = np.ones(10, bool)
+    assert verdicts.contradicted(every, BRIEFLY_S).tolist() == ([0, 1] if doubted else [])
+
+
+def test_windows_in_which_a_sensor_is_left_out_contradict_none_of_its_groups():
+    verdicts = entered(score=20.0)
+    left_out = (verdicts.items.sensor == 1) & (verdicts.items.window > 0)
+    assert not len(verdicts.contradicted(~left_out, BRIEFLY_S))
+    left_out &= verdicts.items.window > 1
+    assert verdicts.contradicted(~left_out, BRIEFLY_S).tolist() == [0, 1]
 
 
 def test_groups_of_three_are_not_contradicted():
@@ -186,7 +195,7 @@ def test_groups_of_three_are_not_contradicted():
     items = Items(window, tracklet, tracklet, first_ns, first_ns + 20_000_000_000, np.full(6, 3))
     verdicts = WindowGroups(items)
     verdicts.enter(np.arange(3), np.arange(3), group_of(3, 20.0))
-    assert not len(verdicts.contradicted(BRIEFLY_S))
+    assert not len(verdicts.contradicted(np.ones(6, bool), BRIEFLY_S))
 
 
 def test_what_is_withdrawn_is_undecided():
