@@ -4,15 +4,26 @@ from collections.abc import Mapping
 
 import numpy as np
 import pyarrow as pa
+import pyarrow.compute as pc
 
 from epipole.io.work.parts import IDENTIFIED, Parts, write_part
 from epipole.io.work.work_layout import ReadFolder
 from epipole.schemas.arrays import Array, Flags
-from epipole.schemas.bridge import array, from_polars, nullable, stack, table, to_polars, unstack
+from epipole.schemas.bridge import (
+    array,
+    concat,
+    from_polars,
+    nullable,
+    stack,
+    table,
+    to_polars,
+    unstack,
+)
+from epipole.schemas.rejects import Reason
 from epipole.schemas.settings import SensorSettings
 from epipole.schemas.spans import Sensor, Span
 from epipole.schemas.stages import Stage
-from epipole.schemas.tables import DETECTIONS
+from epipole.schemas.tables import DETECTIONS, REJECTS
 from epipole.schemas.work_tables import SOLUTIONS
 from epipole.tasks.algorithms.geometry.directions import (
     boresight_angles,
@@ -24,7 +35,7 @@ from epipole.tasks.algorithms.geometry.directions import (
 from epipole.tasks.check.check_sensors import SensorVerdict
 from epipole.tasks.common.stage_tasks import stage_task
 from epipole.tasks.identify.frame_inputs import interpolate_sensor_states
-from epipole.tasks.identify.identify_span import states_about
+from epipole.tasks.identify.identify_span import states_about, without_state
 
 STATE_COLUMNS = [
     *("x_km", "y_km", "z_km"),
@@ -61,7 +72,7 @@ def correct_clock(
     at_frames = interpolate_sensor_states(tables["solutions"], states, settings)
     tables["solutions"] = with_sensor_states(tables["solutions"], at_frames)
     tables |= with_prior_attitudes(tables["solutions"], tables["detections"], at_frames)
-    tables["rejects"] = identified.read(span, "rejects")
+    tables["rejects"] = rejects_at_true_times(identified.read(span, "rejects"), at_frames)
     write_part(parts.of(span), IDENTIFIED, tables)
 
 
@@ -81,6 +92,15 @@ def with_sensor_states(solutions: pa.Table, at_frames: pa.Table) -> pa.Table:
         states, on=key, how="left", maintain_order="left"
     )  # fmt: skip
     return from_polars(SOLUTIONS, moved)
+
+
+def rejects_at_true_times(rejects: pa.Table, at_frames: pa.Table) -> pa.Table:
+    """Return REJECTS of a part; frames without a state are those at the true times.
+
+    At the ends of a log and of gaps, other frames have a state near than by the wrong clock.
+    """
+    others = rejects.filter(pc.not_equal(rejects["reason"], Reason.NO_STATE.value))
+    return concat(REJECTS, [others, without_state(at_frames)])
 
 
 def with_prior_attitudes(

@@ -104,7 +104,7 @@ def _identify_span(
         identified = identify_stars(
             exposures, frame_states, cameras, catalogue, sensors, identification, max_detections
         )
-        rejects = concat(REJECTS, [identified.rejects, _without_state(frame_states)])
+        rejects = concat(REJECTS, [identified.rejects, without_state(frame_states)])
         tables = {**identified._asdict(), "rejects": rejects}
         write_part(parts.of(span), IDENTIFIED, tables, key=key)
     return _counts(parts, span)
@@ -134,7 +134,7 @@ def states_about(frames: ReadFolder, sensor: Sensor, span: Span, state_gap_s: fl
     return states if sensor.has_velocities else without_velocities(states)
 
 
-def _without_state(frame_states: pa.Table) -> pa.Table:
+def without_state(frame_states: pa.Table) -> pa.Table:
     """Return a row of `rejects` for the frames that have no state near in time."""
     without = frame_states.filter(pc.is_null(frame_states["x_km"]))
     first = without.slice(0, 1)

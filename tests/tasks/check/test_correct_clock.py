@@ -3,8 +3,9 @@
 import numpy as np
 import pyarrow as pa
 
-from epipole.schemas.bridge import array, nullable, stack, table, unstack
-from epipole.schemas.tables import DETECTIONS
+from epipole.schemas.bridge import array, concat, nullable, stack, table, unstack
+from epipole.schemas.rejects import Reason, reject_rows
+from epipole.schemas.tables import DETECTIONS, REJECTS
 from epipole.schemas.work_tables import SENSOR_STATES_AT_FRAMES, SOLUTIONS
 from epipole.tasks.algorithms.geometry.directions import (
     matrix_from_quaternion,
@@ -15,9 +16,11 @@ from epipole.tasks.algorithms.geometry.directions import (
 from epipole.tasks.check.check_sensors import SensorVerdict
 from epipole.tasks.check.correct_clock import (
     at_true_times,
+    rejects_at_true_times,
     with_prior_attitudes,
     with_sensor_states,
 )
+from epipole.tasks.identify.identify_span import without_state
 
 LATE, EARLY = SensorVerdict("a", 0.25, 0.01, "clock"), SensorVerdict("b", -0.5, 0.01, "clock")
 
@@ -53,6 +56,17 @@ def test_states_are_joined_by_frame_whatever_their_order():
     assert moved["sensor_id"].equals(solutions["sensor_id"])
     missing = with_sensor_states(solutions, at_frames.slice(1))
     assert missing["x_km"].to_pylist() == [None, 1.0, 2.0, 3.0, 4.0, 5.0]
+
+
+def test_frames_that_have_no_state_at_their_true_times_are_counted():
+    by_clock = frames(SENSOR_STATES_AT_FRAMES, x_km=pa.array([None, *[1.0] * 5]))
+    other = reject_rows(Reason.OUTSIDE_IMAGE, sensor_id=["a"], time=[5], count=[2])
+    before = concat(REJECTS, [other, without_state(by_clock)])
+    at_true = frames(SENSOR_STATES_AT_FRAMES, x_km=pa.array([1.0, *[None] * 2, *[1.0] * 3]))
+    for now, count in ((at_true, 2), (by_clock, 1), (by_clock.slice(1), 0)):
+        after = rejects_at_true_times(before, now)
+        found = dict(zip(after["reason"].to_pylist(), after["count"].to_pylist(), strict=True))
+        assert found == {"outside_image": 2} | ({"no_state": count} if count else {})
 
 
 def test_prior_attitudes_are_those_at_the_true_times():
