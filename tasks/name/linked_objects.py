@@ -134,9 +134,10 @@ def add_linked_members(
         shared = views.filter(kept)["object"].unique().to_list()
         if shared:
             rows, changed = _with_linked(members, linked.filter(kept), shared, span, max_views)
-            tables = {"members": from_polars(OBJECT_MEMBERS, rows)}
-            write_part(solved.with_links().objects.of(span), NUMBERED, tables)
-            pieces += changed
+            if changed:  # else the linked ones have views beside the span only
+                tables = {"members": from_polars(OBJECT_MEMBERS, rows)}
+                write_part(solved.with_links().objects.of(span), NUMBERED, tables)
+                pieces += changed
     return LinkedMembers(pieces, ids, refused)
 
 
@@ -255,7 +256,7 @@ def _with_linked(
         rest, known.join(pieces, on="object").select(rest.columns),
         new.with_columns(pl.col("piece") + n_before),
     ]).sort("piece", "object", "sensor", "tracklet_id", "first_epoch")  # fmt: skip
-    n_pieces = max(n_before, rows["piece"].to_numpy().max() + 1)
+    n_pieces = max(n_before, rows["piece"].to_numpy().max(initial=-1) + 1)
     numbers = sorted({*changed["piece"], *range(n_before, n_pieces)})
     return rows, [Piece(span, number, int(n_pieces)) for number in numbers]
 

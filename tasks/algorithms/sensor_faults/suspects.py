@@ -13,9 +13,11 @@ from typing import NamedTuple
 import numpy as np
 
 from epipole.schemas.arrays import Array, Flags, Indices
-from epipole.tasks.algorithms.association.odds import seeing
+from epipole.tasks.algorithms.association.odds import MAX_RANGE_RATIO, seeing
 from epipole.tasks.algorithms.association.samples import FREE, Groups, Samples
-from epipole.tasks.algorithms.geometry.triangulation import triangulate
+from epipole.tasks.algorithms.constants import SPEED_OF_LIGHT_KM_S
+from epipole.tasks.algorithms.geometry.directions import tangent_basis
+from epipole.tasks.algorithms.geometry.triangulation import Triangulated, triangulate
 from epipole.tasks.algorithms.sensor_faults.fault_judgement import (
     ATTITUDE,
     CLOCK,
@@ -38,6 +40,11 @@ MAX_TOGETHER = 24  # maximum number of sensors that are judged together
 MAX_ROUNDS = 4  # each round judges the next suspects, without the sensors already at fault
 MIN_JOINED_SHARE = 0.3  # minimum share of the objects in its field that a sound sensor joins
 MIN_UNASSIGNED = 0.5  # minimum of unassigned tracklets per object in the field of a faulty sensor
+NEAR_SIGMA = 5.0  # nearer to an object than this a tracklet may be of it
+LIGHT_TIME_RAD = 8.0 / SPEED_OF_LIGHT_KM_S  # angle that a low object moves while its light comes
+# An object counts as missed if it is brighter by this than the faintest that the sensor shows: seen
+# from two sides it may differ by a magnitude.
+BRIGHTER_MAG = 1.0
 
 
 def judge_many_sensors(
@@ -229,9 +236,10 @@ class Agreement(NamedTuple):
     """How many objects were in each sensor's field, and how many it joined.
 
     n_in_field : (s,) int
-        Objects of at least two other sensors that were in the sensor's field.
+        Objects of at least two other sensors that were in the sensor's field, bright enough for it.
     n_joined : (s,) int
-        Objects among these with a tracklet of the sensor.
+        Objects among these with a tracklet of the sensor, or with one so near that it may be of
+        the object: where that is not decided, the sensor does not disagree.
     n_unassigned : (s,) int
         Tracklets of the sensor without an object, or with an object of doubted sensors only: their
         tracklets may agree with each other, but with no other sensor's.
@@ -268,21 +276,73 @@ def agreement(samples: Samples, groups: Groups) -> Agreement:
     np.add.at(n_members, (group, samples.sensor[member]), 1)
     points = _triangulated(samples, member, group, instant, n_groups)
     half_field = np.array(samples.half_field, float)
-    in_field = np.zeros(n_sensors, bool)
-    for g in np.flatnonzero(np.isfinite(points[:, 0])).tolist():
+    bright = _bright_enough(samples, member, group, instant, points.r_km)
+    in_field, missed = np.zeros(n_sensors, bool), np.zeros((n_groups, n_sensors), bool)
+    for g in np.flatnonzero(np.isfinite(points.r_km[:, 0])).tolist():
         position, attitude = (
             np.ascontiguousarray(values[:, instant[g]])
             for values in (samples.sensor_km, samples.R_sensor_from_icrs)
         )
-        seeing(position, attitude, half_field, points[g], in_field)
+        seeing(position, attitude, half_field, points.r_km[g], in_field)
         others = n_members[g].sum() - n_members[g] >= 2
-        n_in_field += others & (in_field | (n_members[g] > 0))
-        n_joined += others & (n_members[g] > 0)
+        joined = n_members[g] > 0
+        missed[g] = others & in_field & ~joined & bright[g]
+        n_in_field += missed[g] | (others & joined)
+        n_joined += others & joined
     found = Agreement(n_in_field, n_joined, np.zeros(n_sensors, np.int64))
+    for sensor in np.flatnonzero(found.doubted).tolist():
+        for g in np.flatnonzero(missed[:, sensor]).tolist():
+            at = points.r_km[g], points.cov_km2[g]
+            n_joined[sensor] += _has_near(samples, sensor, instant[g], *at)
     has_members = n_members.astype(bool)[:, ~found.doubted].any(axis=1)
     unassigned = np.append(~has_members, True)  # the last one is FREE
     n_unassigned = np.bincount(samples.sensor[unassigned[groups.group]], minlength=n_sensors)
     return found._replace(n_unassigned=n_unassigned)
+
+
+def _bright_enough(
+    samples: Samples, member: Indices, group: Indices, instant: Indices, x_km: Array
+) -> Flags:
+    """Return whether a sensor that has objects in its field should detect them: (g, s).
+
+    By the magnitudes of the members, and the faintest that the sensor shows; where these are
+    unknown, by the ranges.
+    """
+    toward = x_km[:, None] - samples.sensor_km[:, instant].transpose(1, 0, 2)
+    range_km = np.linalg.norm(toward, axis=2)
+    of_member = range_km[group, samples.sensor[member]]
+    nearest = np.full(len(x_km), np.inf)
+    np.fmin.at(nearest, group, of_member)
+    bright = range_km < MAX_RANGE_RATIO * nearest[:, None]
+    if samples.magnitude is None:
+        return bright
+    faintest = np.full(range_km.shape[1], -np.inf)
+    np.fmax.at(faintest, samples.sensor, samples.magnitude)
+    reduced = samples.magnitude[member] - 5.0 * np.log10(of_member)
+    known = np.isfinite(reduced)
+    count = np.bincount(group[known], minlength=len(x_km))
+    mean = np.bincount(group[known], reduced[known], len(x_km)) / np.maximum(count, 1)
+    expected = mean[:, None] + 5.0 * np.log10(range_km)
+    judged = (count > 0)[:, None] & np.isfinite(faintest)
+    return np.where(judged, expected < faintest - BRIGHTER_MAG, bright)
+
+
+def _has_near(samples: Samples, sensor: int, m: int, x_km: Array, cov_km2: Array) -> bool:
+    """Return whether a sensor has a tracklet at instant m that may be of the object there.
+
+    `x_km` (3,) and `cov_km2` (3, 3) are the object's position [km], GCRF, and its covariance.
+    """
+    rows = np.flatnonzero((samples.sensor == sensor) & samples.seen[:, m])
+    toward = x_km - samples.sensor_km[sensor, m]
+    range_km = np.linalg.norm(toward)
+    u = samples.u[rows, m]
+    basis = tangent_basis(u)
+    off = basis @ (toward / range_km)
+    position = cov_km2 + samples.sigma_km[rows, m][:, None, None] ** 2 * np.eye(3)
+    cov = samples.cov[rows, m] + basis @ position @ basis.transpose(0, 2, 1) / range_km**2
+    cov = cov + LIGHT_TIME_RAD**2 * np.eye(2)
+    chi2 = np.einsum("ni,ni->n", off, np.linalg.solve(cov, off[:, :, None])[:, :, 0])
+    return bool(((chi2 < NEAR_SIGMA**2) & (u @ toward > 0.0)).any())
 
 
 def _members_at_best(samples: Samples, groups: Groups) -> tuple[Indices, Indices, Indices]:
@@ -302,10 +362,10 @@ def _members_at_best(samples: Samples, groups: Groups) -> tuple[Indices, Indices
 
 def _triangulated(
     samples: Samples, member: Indices, group: Indices, instant: Indices, n_groups: int
-) -> Array:
-    """Return the triangulated points of groups [km], GCRF, (g, 3); NaN where that fails."""
+) -> Triangulated:
+    """Return the triangulated points of groups; NaN where that fails."""
     m = instant[group]
-    x, *_ = triangulate(
+    return triangulate(
         np.searchsorted(group, np.arange(n_groups + 1)),
         samples.sensor_km[samples.sensor[member], m],
         samples.u[member, m],
@@ -314,4 +374,3 @@ def _triangulated(
         np.zeros((n_groups, 3)),
         np.inf,
     )
-    return x

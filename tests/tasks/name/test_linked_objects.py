@@ -188,6 +188,17 @@ def test_an_object_at_the_end_of_a_span_is_in_both(tmp_path, all_meet):
         assert sum(rows["n_views"].to_pylist()) == 8
 
 
+@pytest.mark.parametrize("others", [[], OTHERS])
+def test_a_span_that_an_object_only_comes_near_to_stays_as_it_is(tmp_path, all_meet, others):
+    solved = solved_spans(tmp_path, *others)
+    begin = (NEXT.start_ns - ns(0)) / SECOND_NS
+    times = [begin, begin + 2, begin + 4]
+    joined = at_once([(name, k, "x", times[0], times[-1]) for k, name in enumerate("ab")], "ab")
+    found = add(tmp_path, solved, joined, {0: {"a": times}, 1: {"b": times}, **SEEN}, {})
+    assert found.pieces == [Piece(NEXT, 0, 1)]
+    assert not solved.with_links().objects.holds(SPAN)
+
+
 def test_tracklets_whose_lines_of_sight_do_not_meet_are_refused(tmp_path):
     """Of two objects, seen by four sensors, each object's own tracklets meet."""
     of = tables(Scene(11, 4, times=np.arange(0.0, 60.0, 2.0)).objects(2, spread_km=300.0))

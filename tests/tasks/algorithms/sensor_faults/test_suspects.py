@@ -196,3 +196,35 @@ def test_without_groups_no_sensor_is_judged():
     samples = Scene(4, 3).strays(3).samples()
     found = agreement(samples, solve(samples))
     assert found.disagreeing().tolist() == []
+
+
+def test_a_sensor_whose_tracklets_may_be_of_the_objects_does_not_disagree():
+    """In a short window they are often undecided."""
+    samples = Scene(6, 4).objects(8, spread_km=100.0).samples()
+    groups = solve(samples)
+    undecided = groups._replace(group=np.where(samples.sensor == 3, FREE, groups.group))
+    found = agreement(samples, undecided)
+    assert found.n_unassigned[3] == 8
+    assert found.n_joined[3] == found.n_in_field[3] == 8
+    assert found.disagreeing().tolist() == []
+
+
+@pytest.mark.parametrize(("faintest", "disagreeing"), [(12.5, []), (14.0, [3])])
+def test_an_object_too_faint_for_a_sensor_is_not_missed(faintest, disagreeing):
+    scene = Scene(7, 4).objects(8, spread_km=100.0, seen_by=[0, 1, 2]).strays(9, sensors=[3])
+    samples = scene.samples()
+    magnitude = np.where(samples.sensor == 3, faintest - np.arange(len(samples.sensor)) % 3, 12.0)
+    found = agreement(samples._replace(magnitude=magnitude), solve(samples))
+    assert found.disagreeing().tolist() == disagreeing
+
+
+def test_without_magnitudes_a_much_nearer_sensor_sees_more():
+    scene = Scene(8, 4).objects(8, spread_km=100.0, seen_by=[0, 1, 2]).strays(9, sensors=[3])
+    samples = scene.samples()
+    groups = solve(samples)
+    assert agreement(samples, groups).disagreeing().tolist() == [3]
+    away = GEO - scene.r[3]
+    r = samples.sensor_km.copy()
+    r[3] -= away  # twice as far
+    far = samples._replace(sensor_km=r, magnitude=np.full(len(samples.sensor), np.nan))
+    assert agreement(far, groups).disagreeing().tolist() == []
