@@ -23,6 +23,7 @@ from epipole.tasks.common.sightings import only_id
 from epipole.tasks.solve.view_groups import ObjectViews, ViewGroups
 
 VELOCITY_WINDOW_S = 30.0  # positions within this time give an object's velocity
+ORBITAL_KM_S = 5.0  # 1-sigma of a velocity per axis, where nothing is known of it
 
 
 def solve_positions(
@@ -30,9 +31,10 @@ def solve_positions(
 ) -> ViewGroups:
     """Return the positions, with covariances, of objects that two or more sensors detect.
 
-    They are solved twice. The first solution gives the velocities. The second one needs them
-    because the light times to the sensors differ, and because the fits of the directions neglected
-    a part of the motion.
+    They are solved twice. The first solution gives the velocities: by its positions, or by the
+    rates of the directions where there is a single one. The second solution needs them because the
+    light times to the sensors differ, and because the fits of the directions neglected a part of
+    the motion.
 
     Parameters
     ----------
@@ -61,6 +63,8 @@ def _solve(views: ObjectViews, reject_sigma: float) -> ViewGroups:
             offsets, views.r_km, views.u, views.cov, views.sigma_km, velocity, reject_sigma
         )
         velocity, spread_s = _velocities(epoch_ns, number, x_km)
+        alone = np.flatnonzero((spread_s == 0.0) & np.isfinite(chi2))
+        velocity[alone] = _velocities_by_rates(views, offsets, alone, x_km, used)
         if not last:
             sigma = np.sqrt(traces(cov_km2) / 3)
             state = np.hstack([x_km, velocity])[group]
@@ -164,6 +168,31 @@ def _velocities(epoch_ns: Indices, number: Indices, x_km: Array) -> tuple[Array,
     time_s = (epoch_ns[order] - origin) / 1e9
     v_km_s[order], spread_s[order] = velocities(offsets, time_s, x_km[order], VELOCITY_WINDOW_S)
     return v_km_s, spread_s
+
+
+def _velocities_by_rates(
+    views: ObjectViews, offsets: Indices, wanted: Indices, x_km: Array, used: Flags
+) -> Array:
+    """Return velocities [km/s] of the wanted groups, by the rates of their used views: (w, 3).
+
+    Least squares: each view shows the motion across its line of sight. What none shows stays 0.
+    """
+    of_wanted = np.isin(np.arange(len(x_km)), wanted)
+    group = np.repeat(np.arange(len(x_km)), np.diff(offsets))
+    known = views.w.any(axis=1) & np.isfinite(views.v_km_s).all(axis=1)
+    rows = np.flatnonzero(of_wanted[group] & used & known)
+    group = np.searchsorted(wanted, group[rows])
+    u, range_km = views.u[rows], lengths(x_km[wanted][group] - views.r_km[rows])
+    fitted_s = (views.last_ns[rows] - views.first_ns[rows]) / 1e9
+    noise_rad = np.sqrt(traces(views.cov_noise[rows]) / 2)
+    sigma_km_s = np.sqrt(12.0) * noise_rad * range_km / np.maximum(fitted_s, 1e-3)
+    across = (np.eye(3) - u[:, :, None] * u[:, None, :]) / (sigma_km_s**2)[:, None, None]
+    normal = np.tile(np.eye(3) / ORBITAL_KM_S**2, (len(wanted), 1, 1))
+    right = np.zeros((len(wanted), 3))
+    seen_km_s = range_km[:, None] * views.w[rows] + views.v_km_s[rows]
+    np.add.at(normal, group, across)
+    np.add.at(right, group, np.einsum("nij,nj->ni", across, seen_km_s))
+    return np.asarray(np.linalg.solve(normal, right[:, :, None])[:, :, 0])
 
 
 def position_table(groups: ViewGroups) -> pa.Table:

@@ -40,6 +40,8 @@ class ObjectViews(NamedTuple):
         First and last detection that the direction was fitted to.
     u, cov_noise, cov_bias : (n, 3), (n, 2, 2), (n, 2, 2) float
         Directions, ICRS, and the covariances on their tangent planes [rad^2].
+    w : (n, 3) float
+        Rates of the directions [rad/s], ICRS; 0 where unknown.
     moments, unmodelled : (n, 3), (n,) float
         Moments of the fitted times [s, s^2, s^3], and the neglected motion [rad^2].
     r_km, v_km_s, sigma_km : (n, 3), (n, 3), (n,) float
@@ -59,6 +61,7 @@ class ObjectViews(NamedTuple):
     u: Array
     cov_noise: Array
     cov_bias: Array
+    w: Array
     moments: Array
     unmodelled: Array
     r_km: Array
@@ -105,6 +108,7 @@ def unpack_views(views: pa.Table, object_number: Indices) -> ObjectViews:
         u=stack(views, "u{}"),
         cov_noise=stack_covariance(views, "cov_noise_{}_rad2", TANGENT_AXES),
         cov_bias=stack_covariance(views, "cov_bias_{}_rad2", TANGENT_AXES),
+        w=stack(views, "w{}_rad_s"),
         moments=stack(views, "moment_{}", "123"),
         unmodelled=array(views, "unmodelled_rad2").copy(),
         r_km=stack(views, "{}_km"),

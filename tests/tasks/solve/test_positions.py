@@ -148,6 +148,54 @@ def test_what_the_fits_of_directions_neglect_does_not_add_up():
     assert abs(np.mean(mean_off) - 1) < 0.39  # three sigma of 40 trials with three axes
 
 
+def seen_once(rng, rates=True):
+    """Views at one epoch of a low object, by a low sensor and a geostationary one; where it is.
+
+    The two see it where it was 0.005 s and 0.14 s before.
+    """
+    r_km = np.array([[6000.0, 4200.0, 300.0], [-20000.0, 36000.0, 9000.0]])
+    v_km_s = np.array([[-3.0, 4.0, 5.0], [-2.7, -1.5, 0.0]])
+    x_km, velocity = np.array([5600.0, 4900.0, 1500.0]), np.array([-4.2, 1.5, 6.0])
+    sigma, fitted_s = np.array([5.0, 2.0]) * ARCSEC, 6.0
+    delay_s = np.linalg.norm(x_km - r_km, axis=1)[:, None] / SPEED_OF_LIGHT_KM_S
+    path = x_km - velocity * delay_s - r_km
+    range_km = np.linalg.norm(path, axis=1, keepdims=True)
+    u = path / range_km
+    across = (velocity - v_km_s) / range_km
+    w = across - np.sum(u * across, axis=1, keepdims=True) * u
+    basis = tangent_basis(u)
+    noise = rng.normal(size=(2, 2, 2)) * sigma[:, None]
+    u = u + np.einsum("na,nai->ni", noise[0], basis)
+    w = w + np.einsum("na,nai->ni", noise[1] * np.sqrt(12) / fitted_s, basis)
+    half_ns = round(fitted_s / 2 * 1e9)
+    views = filled(VIEWS, 2, {
+        "epoch": [T0, T0], "sensor_id": ["a", "b"], "tracklet_id": ["a-1", "b-1"],
+        "first_fitted": [T0 - half_ns] * 2, "last_fitted": [T0 + half_ns] * 2,
+        **unstack("u{}", u / np.linalg.norm(u, axis=1, keepdims=True)),
+        **unstack("w{}_rad_s", w * rates), **unstack("{}_km", r_km),
+        **unstack("sensor_v{}_km_s", v_km_s),
+        **{f"cov_noise_{ab}_rad2": sigma**2 for ab in ("11", "22")},
+        "position_sigma_km": [0.01] * 2, "pixel_rad": [1e-4] * 2,
+    })  # fmt: skip
+    return views, x_km - velocity * delay_s.mean()
+
+
+def test_a_single_position_is_honest_where_light_times_differ():
+    rng, errors = np.random.default_rng(5), []
+    for _ in range(400):
+        views, true_km = seen_once(rng)
+        position = position_table(solved(views, np.zeros(2, np.int64)))
+        off = stack(position, "{}_km") - true_km
+        covariance = stack_covariance(position, "cov_{}")
+        errors.append((off @ np.linalg.solve(covariance, off[:, :, None])[0]).item() / 3)
+    assert 0.9 < np.mean(errors) < 1.1
+
+
+def test_a_position_without_rates_takes_the_object_as_at_rest():
+    views, _ = seen_once(np.random.default_rng(6), rates=False)
+    assert not solved(views, np.zeros(2, np.int64)).velocity_km_s.any()
+
+
 def views_of_five(miss=None):
     """Views of one object at one epoch by five sensors; the fourth has the smallest error."""
     angle = np.linspace(-1.2, 1.2, 5)
