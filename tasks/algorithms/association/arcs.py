@@ -12,6 +12,7 @@ from epipole.tasks.algorithms.association.views import PLANE, X, Y, direction, r
 from epipole.tasks.algorithms.constants import GM_KM3_S2, LN_2PI
 from epipole.tasks.algorithms.earth_gravity import advance
 from epipole.tasks.algorithms.kernels import kernel
+from epipole.tasks.algorithms.orbit_linking.population import COMPONENTS, SHARE, SIGMA
 from epipole.tasks.algorithms.symmetric_matrices import factor
 
 STEP_S = 60.0  # longest step of the propagation: one of a low orbit errs by 0.1 m
@@ -292,6 +293,44 @@ def _is_hyperbolic(state, L):
 
 
 @kernel
+def _circular_odds(state, L):
+    """Return the log-odds of orbits as objects have them over those of any eccentricity.
+
+    Most orbits are nearly circular; lines of sight that meet by accident show any velocity. The
+    velocities of objects are the mixture of `population`, those by accident its second component.
+
+    `state` (6,) [km, km/s], GCRF; `L` (6, 6) is its information, factored by `factor`.
+    """
+    r = np.sqrt(state[0] ** 2 + state[1] ** 2 + state[2] ** 2)
+    axes, radial, level = np.zeros((2, 6)), 0.0, 0.0  # of radial and horizontal velocity
+    for a in range(3):
+        axes[0, 3 + a] = state[a] / r
+        radial += axes[0, 3 + a] * state[3 + a]
+    for a in range(3):
+        axes[1, 3 + a] = state[3 + a] - radial * axes[0, 3 + a]
+        level += axes[1, 3 + a] ** 2
+    level = np.sqrt(max(level, 1e-12))
+    circular, S = np.sqrt(GM_KM3_S2 / r), np.zeros((2, 2))
+    for i in range(2):
+        for a in range(3):
+            axes[i, 3 + a] /= level if i else 1.0
+        for a in range(6):
+            for c in range(a):
+                axes[i, a] -= L[a, c] * axes[i, c]
+            axes[i, a] /= L[a, a]
+            S[i, i] += axes[i, a] ** 2
+    for a in range(6):
+        S[0, 1] += axes[0, a] * axes[1, a]
+    off, of_component = level - circular, np.empty(COMPONENTS)
+    for c in range(COMPONENTS):
+        V0, V1 = S[0, 0] + (SIGMA[c] * circular) ** 2, S[1, 1] + (SIGMA[c] * circular) ** 2
+        det = V0 * V1 - S[0, 1] ** 2
+        chi2 = (V1 * radial**2 - 2.0 * S[0, 1] * radial * off + V0 * off**2) / det
+        of_component[c] = -0.5 * (np.log(det) + chi2)
+    return np.log(SHARE[1] + SHARE[0] * np.exp(of_component[0] - of_component[1]))
+
+
+@kernel
 def arc_odds(views, chance, members, points):
     """Return the log-odds of one orbit against unrelated tracklets, by the directions alone.
 
@@ -330,6 +369,7 @@ def arc_odds(views, chance, members, points):
     if _is_hyperbolic(state, N):
         return -np.inf, 0.0
     total = log_prior + 3.0 * LN_2PI - 0.5 * log_det - 0.5 * (chi2 - gain)
+    total += _circular_odds(state, N)
     fragments = 0.0
     for q in range(len(members)):
         unrelated, together = _unrelated_odds_of_sensor(views, chance, members, q, first, at)

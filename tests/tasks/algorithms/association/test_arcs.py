@@ -3,8 +3,11 @@
 import numpy as np
 import pytest
 from scenes.tracklet_scenes import GEO, V_GEO, Scene, judge, solve
+from scipy.stats import multivariate_normal
 
-from epipole.tasks.algorithms.association.arcs import factor
+from epipole.tasks.algorithms.association.arcs import _circular_odds, factor
+from epipole.tasks.algorithms.constants import GM_KM3_S2
+from epipole.tasks.algorithms.orbit_linking.population import SHARE, SIGMA
 from epipole.tasks.algorithms.orbits.orbit_fit import propagate
 
 
@@ -91,3 +94,40 @@ def test_a_broken_track_is_no_more_evidence_than_a_whole_one(pieces):
     assert (whole.group == 0).all()
     assert (broken.group == 0).all()
     assert broken.score[0] == pytest.approx(whole.score[0], abs=1.0)
+
+
+def circular_odds(state, covariance):
+    factored = np.linalg.cholesky(np.linalg.inv(covariance))
+    return _circular_odds(np.array(state), factored)
+
+
+LOW = np.array([5200.0, 4100.0, 2700.0])
+SPEED = np.sqrt(GM_KM3_S2 / np.linalg.norm(LOW))
+UP = LOW / np.linalg.norm(LOW)
+ALONG = np.cross(UP, [0.0, 0.6, 0.8]) / np.linalg.norm(np.cross(UP, [0.0, 0.6, 0.8]))
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_the_odds_of_a_circular_orbit_are_those_of_two_normal_distributions(seed):
+    rng = np.random.default_rng(seed)
+    half = rng.normal(size=(6, 6)) * np.repeat([2.0, 0.5], 3)[:, None]
+    covariance = half @ half.T * rng.choice([0.01, 0.1])
+    velocity = SPEED * ALONG + rng.normal(size=3) * 0.5
+    level = velocity - UP * (UP @ velocity)
+    axes = np.stack([UP, level / np.linalg.norm(level)])
+    of_axes = axes @ covariance[3:, 3:] @ axes.T
+    found = [UP @ velocity, np.linalg.norm(level) - SPEED]
+    nearly, any_ = (
+        multivariate_normal(cov=of_axes + np.eye(2) * (sigma * SPEED) ** 2).pdf(found)
+        for sigma in SIGMA
+    )
+    odds = circular_odds([*LOW, *velocity], covariance)
+    assert odds == pytest.approx(np.log(SHARE[0] * nearly / any_ + SHARE[1]), abs=1e-9)
+
+
+def test_a_circular_orbit_is_likelier_an_eccentric_one_less_likely_and_an_unknown_one_neither():
+    precise, wide = np.diag([1e-2] * 3 + [1e-6] * 3), np.diag([1e4] * 3 + [1e4] * 3)
+    circular, eccentric = ([*LOW, *(speed * SPEED * ALONG)] for speed in (1.0, 1.2))
+    assert circular_odds(circular, precise) > 5.0
+    assert circular_odds(eccentric, precise) == pytest.approx(np.log(SHARE[1]), abs=1e-3)
+    assert circular_odds(eccentric, wide) == pytest.approx(0.0, abs=1e-2)

@@ -14,7 +14,7 @@ BRIEFLY_S = 7.5
 
 def ten_minutes(seed: int) -> Scene:
     scene = Scene(seed, 2, times=np.arange(3.0, 600.0, EVERY_S))
-    return scene.objects(10).strays(30)
+    return scene.objects(10).strays(100)
 
 
 def entered(score: float, tracklets=(0, 1)) -> WindowGroups:
