@@ -142,10 +142,13 @@ def row_offsets_s(cameras: pa.Table, camera: Integers, y_px: Array) -> Array:
     return late_s
 
 
-def image_sightings_of(frames: Frames, detections: pa.Table, camera: Camera) -> Sightings:
+def image_sightings_of(frames: Frames, detections: pa.Table, cameras: pa.Table) -> Sightings:
     """Return the sightings in unsolved frames, sorted by frame; directions in sensor axes."""
     row, frame = _in_frames(frames, detections)
-    u = unproject(camera, array(detections, "x_px")[row], array(detections, "y_px")[row])
+    x_px, y_px = array(detections, "x_px")[row], array(detections, "y_px")[row]
+    u = np.empty((len(row), 3))
+    for camera, at in by_camera(frames.camera[frame]):
+        u[at] = unproject(camera_of(cameras, camera), x_px[at], y_px[at])
     noise = centroid_covariance(u, array(detections, "sigma_arcsec")[row] * ARCSEC)
     offsets = np.searchsorted(frame, np.arange(len(frames.number) + 1))
     return Sightings(row, frame, frames.time_ns[frame], offsets, u, noise, np.zeros_like(noise))

@@ -7,7 +7,7 @@ from scipy.spatial import cKDTree
 from epipole.schemas.arrays import Array, Flags, Integers
 from epipole.schemas.bridge import array
 from epipole.tasks.algorithms.constants import ARCSEC, SECOND_NS
-from epipole.tasks.algorithms.geometry.camera import Camera, unproject
+from epipole.tasks.algorithms.geometry.camera import Camera, pixel_angle, unproject
 from epipole.tasks.algorithms.geometry.directions import matrix_from_quaternion
 from epipole.tasks.algorithms.geometry.turning import angular_rates, turned
 from epipole.tasks.algorithms.orbits.planets import planet_directions
@@ -17,11 +17,27 @@ from epipole.tasks.common.sightings import Frames, Sightings, by_camera, camera_
 GATE_SIGMA = 4.0  # largest distance of a detection from a known hot pixel, planet or star
 
 
+def stated_sigma_px(
+    frames: Frames, sightings: Sightings, detections: pa.Table, cameras: pa.Table
+) -> Array:
+    """Return the 1-sigma error of each sighting in the image [px]; `cameras` are those of
+    `frames`."""
+    x_px, y_px = (array(detections, name)[sightings.row] for name in ("x_px", "y_px"))
+    pixel_rad = np.empty(len(sightings.row))
+    for row, of in by_camera(frames.camera[sightings.frame]):
+        camera = camera_of(cameras, row)
+        # Off the boresight a pixel is smaller: at 45 degrees by four tenths.
+        pixel_rad[of] = pixel_angle(camera, unproject(camera, x_px[of], y_px[of]))
+    return np.asarray(array(detections, "sigma_arcsec")[sightings.row] * ARCSEC / pixel_rad)
+
+
 def static_positions(
-    frames: Frames, sightings: Sightings, detections: pa.Table, camera: Camera
+    frames: Frames, sightings: Sightings, detections: pa.Table, sigma_px: Array, camera: Camera
 ) -> FixedPositions:
-    """Return the pixel positions that sightings stay at, and how likely each is a hot pixel."""
-    sigma_px = array(detections, "sigma_arcsec")[sightings.row] * ARCSEC / camera.pixel_rad
+    """Return the pixel positions that sightings stay at, and how likely each is a hot pixel.
+
+    sigma_px : (n,) float, of `stated_sigma_px`
+    """
     return fixed_positions(
         sightings.frame,
         array(detections, "x_px")[sightings.row],
@@ -33,22 +49,31 @@ def static_positions(
     )
 
 
-def at_hot_pixel(sightings: Sightings, detections: pa.Table, known: Flags, camera: Camera) -> Flags:
-    """Return which sightings stand where hot pixels do; `known` has these among all detections."""
+def at_hot_pixel(
+    sightings: Sightings, detections: pa.Table, known: Flags, sigma_px: Array
+) -> Flags:
+    """Return which sightings stand where hot pixels do.
+
+    known : (d,) bool, these among all detections
+    sigma_px : (n,) float, of `stated_sigma_px`
+    """
     position_px = np.column_stack([array(detections, "x_px"), array(detections, "y_px")])
     if not known.any() or not len(sightings.row):
         return np.zeros(len(sightings.row), bool)
     off_px, _ = cKDTree(position_px[known]).query(position_px[sightings.row])
-    sigma_px = array(detections, "sigma_arcsec")[sightings.row] * ARCSEC / camera.pixel_rad
     return np.asarray(off_px < GATE_SIGMA * sigma_px)
 
 
-def is_planet(frames: Frames, sightings: Sightings, camera: Camera) -> Flags:
-    """Return which sightings lie at a planet, within the errors of both."""
+def is_planet(frames: Frames, sightings: Sightings, cameras: pa.Table) -> Flags:
+    """Return which sightings lie at a planet, within the errors of both; `cameras` are those of
+    `frames`."""
     r_km, v_km_s = np.nan_to_num(frames.r_gcrf_km), np.nan_to_num(frames.v_gcrf_km_s)
     u, error_rad = planet_directions(frames.time_ns, r_km, v_km_s)
     boresight = matrix_from_quaternion(frames.q_sensor_from_icrs)[:, 2]
-    edge = np.cos(camera.half_diagonal_rad + error_rad)
+    widest_rad = max(
+        camera_of(cameras, row).half_diagonal_rad for row, _ in by_camera(frames.camera)
+    )
+    edge = np.cos(widest_rad + error_rad)
     in_field = np.einsum("fpa,fa->fp", u, boresight) > edge
     planets = np.zeros(len(sightings.row), bool)
     sigma = sighting_sigma(sightings)

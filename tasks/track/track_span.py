@@ -47,6 +47,7 @@ from epipole.tasks.common.batches import Batch
 from epipole.tasks.common.sightings import (
     Frames,
     Sightings,
+    by_camera,
     camera_of,
     cameras_of,
     image_sightings_of,
@@ -63,6 +64,7 @@ from epipole.tasks.track.classify_detections import (
     is_planet,
     sighting_sigma,
     star_directions,
+    stated_sigma_px,
     static_positions,
 )
 
@@ -97,7 +99,7 @@ def measure_runs(
     frames: Frames,
     sightings: Sightings,
     track: Integers,
-    camera: Camera,
+    cameras: pa.Table,
     window_s: float,
 ) -> list[TrackRun]:
     """Return the runs of tracks, by track number.
@@ -106,6 +108,8 @@ def measure_runs(
     ----------
     track : (n,) int
         Track of each sighting; NONE where it belongs to none.
+    cameras
+        CAMERAS of the frames.
     window_s
         Half-width of the local motion that residuals are taken from.
     """
@@ -119,7 +123,9 @@ def measure_runs(
     noise = np.take(sightings.cov_noise, order, axis=0)
     bias = np.take(sightings.cov_bias, order, axis=0)
     smooth, *_ = directions_at(first, last, t, 0.0, t, u, noise, bias, window_s)
-    miss = lengths(u - smooth)
+    miss, pixel_rad = lengths(u - smooth), camera_of(cameras, int(frames.camera[0])).pixel_rad
+    for row, of in by_camera(frames.camera[sightings.frame[order]]):
+        miss[of] *= pixel_rad / camera_of(cameras, row).pixel_rad
     variance, from_prior = traces(noise), ~frames.from_stars[sightings.frame[order]]
     runs = []
     for lo, hi in itertools.pairwise(bounds):
@@ -127,7 +133,7 @@ def measure_runs(
         rate, sigma = _mean_rate(t[lo:hi], u[lo:hi], variance[lo:hi], from_prior[lo:hi].any())
         rests = rate < max(STAR_RATE_SIGMA * sigma, STAR_DRIFT)
         still = rests and sigma < STAR_RATE_KNOWN
-        residual = float(np.sqrt(np.mean(miss[lo:hi] ** 2) / 2)) / camera.pixel_rad
+        residual = float(np.sqrt(np.mean(miss[lo:hi] ** 2) / 2)) / pixel_rad
         runs.append(TrackRun(members, rate, rests, still, residual))
     return runs
 
@@ -230,7 +236,7 @@ def _parts(
         camera = camera_of(cameras, int(unsolved.camera[0]))
         # The intervals of all frames: frames without an attitude may be far apart.
         intervals_s = _intervals_s(np.sort(array(solutions, "time")), unsolved)
-        sightings = image_sightings_of(unsolved, detections, camera)
+        sightings = image_sightings_of(unsolved, detections, cameras)
         yield _TrackedFrames(unsolved, sightings, camera, cameras, *intervals_s, False)
 
 
@@ -277,17 +283,18 @@ def _label(
     """Label the detections of some frames; return their tracklets, and those that may be hot."""
     frames, sightings, camera = part.frames, part.sightings, part.camera
     known = labels.kind == "hot_pixel"
-    fixed = static_positions(frames, sightings, detections, camera)
-    hot = fixed.with_odds(CERTAIN) | at_hot_pixel(sightings, detections, known, camera)
+    sigma_px = stated_sigma_px(frames, sightings, detections, part.cameras)
+    fixed = static_positions(frames, sightings, detections, sigma_px, camera)
+    hot = fixed.with_odds(CERTAIN) | at_hot_pixel(sightings, detections, known, sigma_px)
     labels.kind[sightings.row[hot]] = "hot_pixel"
     planet = np.zeros_like(hot)
     if part.on_sky:
-        planet = is_planet(frames, sightings, camera) & ~hot
+        planet = is_planet(frames, sightings, part.cameras) & ~hot
         labels.kind[sightings.row[planet]] = "planet"
     kept = ~hot & ~planet
     sightings, suspected = part_of(sightings, kept), fixed.with_odds(LIKELY)[kept]
     track = _follow(part, sightings, detections, settings)
-    runs = measure_runs(frames, sightings, track, camera, half_width_s)
+    runs = measure_runs(frames, sightings, track, part.cameras, half_width_s)
     if part.on_sky:
         u_stars = star_directions(frames, identified, part.cameras)
         still = _unlisted_stars(sightings, runs, u_stars)
