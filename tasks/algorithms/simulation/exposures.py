@@ -122,9 +122,9 @@ class Readout:
         self.R = attitude.as_matrix()
         # Where a spot is depends on its row's time, and this on where it is.
         self.rounds = ROW_ROUNDS if sensor.optics.line_time_s else 0
-        if self.rounds:
+        if self.rounds or sensor.jitter:
             # The jitter of a frame is one turn of the whole frame.
-            self._jitter = attitude * attitudes.at(time_ns, r_km, v_km_s).inv()
+            self.jitter = attitude * attitudes.at(time_ns, r_km, v_km_s).inv()
 
     def times_ns(self, frame: Indices, y_px: Array) -> Indices:
         """Return the times of rows of frames; of the frame where a row is not known (NaN)."""
@@ -138,7 +138,7 @@ class Readout:
         r_km, v_km_s = self._sensor.path.at(seconds_since(self._sensor.t0_ns, time_ns))
         if not len(frame):
             return r_km, np.empty((0, 3, 3))
-        attitude = self._jitter[frame] * self._attitudes.at(time_ns, r_km, v_km_s)
+        attitude = self.jitter[frame] * self._attitudes.at(time_ns, r_km, v_km_s)
         return r_km, attitude.as_matrix()
 
 
@@ -219,7 +219,7 @@ class Exposing:
         u_to_sun = np.empty((len(t_s), 3))
         if objects.need_sun:
             u_to_sun = directions_to_sun(readout.time_ns)
-        after = self._later_pose(readout.time_ns)
+        after = self._later_pose(readout)
         none = np.empty(0)
         parts = [true_spots(np.empty(0, np.int64), none, none, none, TARGET, np.empty(0, np.int64))]
         for frame, target in self._pairs_about_field(t_s, r_km, R):
@@ -263,14 +263,17 @@ class Exposing:
         u = d / np.linalg.norm(d, axis=1, keepdims=True)
         return self._image(boost(u, v_observer[frame]), R)
 
-    def _later_pose(self, time_ns: Indices) -> tuple[Array, Array] | None:
+    def _later_pose(self, readout: "Readout") -> tuple[Array, Array] | None:
         """Return positions and rotations at the end of each exposure; None without trails."""
         s = self.sensor
         if not s.trail_error:
             return None
-        later_ns = time_ns + round(s.exposure_s / 2 * 1e9)
+        later_ns = readout.time_ns + round(s.exposure_s / 2 * 1e9)
         r_km, v_km_s = s.path.at(seconds_since(s.t0_ns, later_ns))
-        return r_km, self.attitudes.at(later_ns, r_km, v_km_s).as_matrix()
+        attitude = self.attitudes.at(later_ns, r_km, v_km_s)
+        if s.jitter:
+            attitude = readout.jitter * attitude
+        return r_km, attitude.as_matrix()
 
     def _later_direction(
         self,

@@ -236,3 +236,21 @@ def test_a_trail_widens_the_error_along_the_motion_only():
     assert length.min() > 3.0
     assert np.std(along / length) == pytest.approx(0.1, rel=0.1)
     assert np.abs(across).max() < 0.02 * length.max()
+
+
+def test_the_jitter_of_a_frame_is_not_a_trail():
+    path = {"a_km": 7100.0, "i_deg": 60.0, "mean_anomaly_deg": 1.0}
+    targets = [{"orbit": path, "magnitude": 3.0}]
+    pointing = {"mode": "track", "target": 0, "jitter_arcsec": 300.0}
+    sensor = SENSOR | {"pointing": pointing, "exposure_s": 0.5, "rate_hz": 10.0}
+    places = {}
+    for error in (0.0, 0.5):
+        detection = {"sigma_px": 1e-6, "trail_error": error, "false_points": 0.0}
+        scene = scene_of(sensor | {"detection": detection}, targets=targets, duration_s=4.0)
+        (seen,) = next(stage.expose_blocks(stage.simulate_scene(scene)))
+        frame = np.repeat(seen.frame_number, np.diff(seen.offsets))
+        is_target = seen.kind == TARGET
+        order = np.argsort(frame[is_target])
+        places[error] = np.stack([seen.x_px, seen.y_px], axis=1)[is_target][order]
+    assert len(places[0.5]) == 40
+    assert np.abs(places[0.5] - places[0.0]).max() < 0.05  # it follows the object: no trail
