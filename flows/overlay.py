@@ -21,7 +21,7 @@ from epipole.io.logs.writer import ViewerFile
 from epipole.schemas.bridge import array, to_polars
 from epipole.schemas.errors import DatasetError, LogError, NoFramesError
 from epipole.schemas.options import star_ids_of
-from epipole.schemas.spans import DAY_NS, SPAN_NS, Span, day_of
+from epipole.schemas.spans import DAY_NS, SPAN_NS, Span, day_of, spans_between
 from epipole.tasks.overlay.layout import viewer_layout
 from epipole.tasks.overlay.messages import (
     OBJECTS,
@@ -159,17 +159,28 @@ def _of_night(
     yield ViewerMessage(start_ns, OBJECTS, SCENE, earth(start_ns))
     for fault in row["faults"] if row is not None else ():
         yield log_message(start_ns, Log.Level.ERROR, "check", fault)
-    for span in of_night:
-        tables = _tables(dataset, night, span, given.sensors)
-        messages = [
-            *frame_messages(tables, f"{ids} " if ids else "", shapes),
-            *epoch_messages(tables, lifetime_ns),
-        ]
-        lines = list(log_messages(to_polars(read_table(dataset, "rejects", night, during=span))))
-        counts["frames"] += len(tables.frames)
-        counts["epochs"] += tables.positions["epoch"].n_unique()
-        counts["log_lines"] += len(lines)
-        yield from sorted([*messages, *lines])
+    yield from _left_out(dataset, night, Span(day * DAY_NS, day * DAY_NS + 1), start_ns, counts)
+    for span in spans_between(of_night[0].start_ns, of_night[-1].end_ns):
+        timed = Span(max(span.start_ns, day * DAY_NS + 1), span.end_ns)
+        messages = _left_out(dataset, night, timed, start_ns, counts)
+        if span in of_night:
+            tables = _tables(dataset, night, span, given.sensors)
+            messages += frame_messages(tables, f"{ids} " if ids else "", shapes)
+            messages += epoch_messages(tables, lifetime_ns)
+            counts["frames"] += len(tables.frames)
+            counts["epochs"] += tables.positions["epoch"].n_unique()
+        yield from sorted(messages)
+
+
+def _left_out(
+    dataset: str, night: str, during: Span, first_ns: int, counts: dict[str, int]
+) -> list[ViewerMessage]:
+    """Return the lines of log of a time, those before the first frame at its time: what has no time
+    stands at the start of the night."""
+    rejects = to_polars(read_table(dataset, "rejects", night, during=during))
+    lines = list(log_messages(rejects, first_ns))
+    counts["log_lines"] += len(lines)
+    return lines
 
 
 def _tables(dataset: str, night: str, span: Span, sensors: Sequence[str]) -> SpanTables:

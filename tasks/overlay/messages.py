@@ -116,12 +116,13 @@ def epoch_messages(tables: SpanTables, lifetime_ns: int) -> Iterator[ViewerMessa
         yield ViewerMessage(time_ns, POINTS, CLOUD, points(time_ns, positions))
 
 
-def log_messages(rejects: pl.DataFrame) -> Iterator[ViewerMessage]:
-    """Yield a line of log for each row of REJECTS."""
+def log_messages(rejects: pl.DataFrame, first_ns: int = 0) -> Iterator[ViewerMessage]:
+    """Yield a line of log for each row of REJECTS, at its time or `first_ns`, the later one."""
     for row in _timed(rejects, "time").iter_rows(named=True):
         about = " ".join(filter(None, (row["source"], row["sensor_id"], row["tracklet_id"])))
-        text = f"{about}: {sentence_of(row['reason'])} ({row['count']:,})"
-        yield log_message(row["time_ns"], Log.Level.WARNING, row["stage"], text)
+        what = f"{sentence_of(row['reason'])} ({row['count']:,})"
+        text = f"{about}: {what}" if about else what
+        yield log_message(max(row["time_ns"], first_ns), Log.Level.WARNING, row["stage"], text)
 
 
 def log_message(time_ns: int, level: int, name: str, text: str) -> ViewerMessage:

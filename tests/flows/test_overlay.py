@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import polars as pl
+import pyarrow.parquet as pq
 import pytest
 from mcap.reader import make_reader
 from mcap_protobuf.decoder import DecoderFactory
@@ -164,6 +165,23 @@ def test_what_is_left_out_is_a_line_of_log(written, night_dataset):
     rejects = table(night_dataset, "rejects")
     assert made.log_lines == len(found["foxglove.Log"]) == len(rejects)
     assert [m.name for _, _, m in found["foxglove.Log"]] == rejects["stage"].to_list()
+
+
+def test_what_has_no_time_is_a_line_of_log_at_the_first_frame(night_log, night_dataset, tmp_path):
+    path = shutil.copytree(night_dataset, tmp_path / "out") / f"night={NIGHT}" / "rejects"
+    (file,) = path.glob("*.parquet")
+    rows = pl.read_parquet(file)
+    midnight = pl.lit(datetime.datetime(2019, 4, 1, tzinfo=datetime.UTC))
+    untimed = pl.DataFrame([{"reason": "nothing_read", "stage": "read", "count": 1}])
+    untimed = untimed.with_columns(time=midnight.cast(rows.schema["time"]))
+    with_untimed = pl.concat([untimed, rows], how="diagonal_relaxed").select(rows.columns)
+    like = pq.read_schema(file)
+    pq.write_table(with_untimed.cast(rows.schema).to_arrow().cast(like), file)
+    made = overlay(str(tmp_path / "out"), [str(night_log)], tmp_path / "o.mcap")
+    lines = messages(tmp_path / "o.mcap")["foxglove.Log"]
+    assert made.log_lines == len(lines) == len(with_untimed)
+    first_ns = table(night_dataset, "frames")["time"].dt.timestamp("ns").min()
+    assert lines[0][1] == at(lines[0][2].timestamp) == first_ns
 
 
 def test_the_same_night_gives_the_same_bytes(written, night_log, night_dataset, tmp_path):
