@@ -203,10 +203,16 @@ def _with_defaults(fields: dict[str, str]) -> dict[str, str]:
         raise ValueError(f"MEAN_ELEMENT_THEORY is {fields['MEAN_ELEMENT_THEORY']}, expected SGP4")
     if fields.get("EPHEMERIS_TYPE") == _XP:
         raise ValueError(_OF_XP)
-    epoch = fields["EPOCH"].removesuffix("Z")
     # sgp4 refuses the numbers above 339999, which two-line elements cannot hold.
-    changed = {"EPOCH": epoch if "." in epoch else f"{epoch}.0", "NORAD_CAT_ID": "0"}
+    changed = {"EPOCH": _epoch(fields["EPOCH"]), "NORAD_CAT_ID": "0"}
     return fields | unused | changed
+
+
+def _epoch(text: str) -> str:
+    """Return an epoch with one to six decimals of a second, as sgp4 reads it."""
+    whole, _, decimals = text.removesuffix("Z").partition(".")
+    # Below a microsecond it is a centimetre. What else stands there, such as a zone, is refused.
+    return f"{whole}.{decimals[:6] if decimals.isdigit() else decimals or 0}"
 
 
 def _element_set(title: str, number: int, cospar_id: str, satellite: Any) -> ElementSet:

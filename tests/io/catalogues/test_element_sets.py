@@ -152,6 +152,17 @@ def test_a_letter_that_is_no_text_costs_nothing_but_itself(tmp_path):
     assert found.name == "ISS (Z\N{REPLACEMENT CHARACTER}RYA)"
 
 
+def test_an_epoch_may_have_any_number_of_decimals(tmp_path):
+    whole = omm()["EPOCH"].partition(".")[0]
+    ends = ("", "Z", ".1", ".123456", ".1234567", ".123456789Z")
+    text = json.dumps([*(omm(EPOCH=whole + end) for end in ends), omm(EPOCH=f"{whole}.5+02:00")])
+    known = read_known_objects(write(tmp_path / "a.json", text))
+    first_ns, *others_ns = (each.epoch_ns for each in known.sets)
+    since_ms = [round((at_ns - first_ns) / 1e6, 3) for at_ns in others_ns]
+    assert since_ms == [0.0, 100.0, 123.456, 123.456, 123.456]
+    assert [fault.where for fault in known.faults] == ["message 7"]
+
+
 def test_numbers_may_have_more_than_five_digits(tmp_path):
     text = json.dumps([omm(NORAD_CAT_ID=123456), omm(NORAD_CAT_ID="987654321")])
     known = read_known_objects(write(tmp_path / "a.json", text))
