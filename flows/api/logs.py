@@ -137,8 +137,8 @@ def write_log(
     ValueError
         Where a column is missing, unknown, of the wrong type, or null where it may not be; where a
         velocity or an attitude has a part of its components; where
-        the lists of a frame differ in length; where a sensor's id is invalid;
-        where the encoding is unknown.
+        the lists of a frame differ in length; where a sensor's id is invalid; where a pinhole has
+        `k4`, or a fisheye `p1` or `p2`; where the encoding is unknown.
 
     Warns
     -----
@@ -211,6 +211,8 @@ def _checked(schema: pa.Schema, rows: Any) -> pl.DataFrame:
     _check_written(table_name(schema), checked)
     for names in _VECTORS if schema is _STATES else ():
         _check_whole(names, checked)
+    if schema is _CAMERAS:
+        _check_terms(checked)
     unknown = [pl.col(name).fill_null(0.0) for name in _UNKNOWN_IS_0 if name in schema.names]
     return checked.with_columns(unknown).sort("time", "sensor_id", maintain_order=True)
 
@@ -238,6 +240,20 @@ def _check_whole(names: Sequence[str], states: pl.DataFrame) -> None:
             f"table states: {absent} of {row['sensor_id']} is null in {partly.height} rows that "
             f"have the rest of {', '.join(names)}; give all of them or none"
         )
+
+
+def _check_terms(cameras: pl.DataFrame) -> None:
+    """Raise where a distortion has a term that the messages of its model cannot hold."""
+    for fisheye, lens, absent in ((False, "pinhole", ("k4",)), (True, "fisheye", ("p1", "p2"))):
+        of_lens = cameras.filter(pl.col("fisheye") == fisheye)
+        for term in absent:
+            wrong = of_lens.filter(pl.col(term) != 0.0)
+            if wrong.height:
+                value, sensor_id = wrong[term][0], wrong["sensor_id"][0]
+                raise ValueError(
+                    f"table cameras: {term} of {sensor_id} is {value}; the distortion of a {lens} "
+                    f"in a log is without {' and '.join(absent)}"
+                )
 
 
 def _same_lengths(frames: pl.DataFrame) -> pl.DataFrame:

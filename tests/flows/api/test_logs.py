@@ -142,6 +142,19 @@ def test_a_vector_with_a_part_of_its_components_is_refused(tmp_path, names, abse
         api.write_log(tmp_path / "a.mcap", frames, states, cameras)
 
 
+@pytest.mark.parametrize(
+    ("lens", "term"),
+    [({"k4": [0.1]}, "k4"), ({"fisheye": [True], "p1": [0.1]}, "p1"),
+     ({"fisheye": [True], "p2": [-0.1], "k1": [0.2]}, "p2")],
+)  # fmt: skip
+def test_a_distortion_that_a_log_cannot_hold_is_refused(tmp_path, lens, term):
+    frames, states, cameras = tables()
+    cameras = cameras.with_columns(**{name: pl.Series(value) for name, value in lens.items()})
+    with pytest.raises(ValueError, match=f"table cameras: {term} of a is"):
+        api.write_log(tmp_path / "a.mcap", frames, states, cameras)
+    assert not list(tmp_path.iterdir())
+
+
 def test_missing_columns_are_named(tmp_path):
     frames, states, cameras = tables()
     with pytest.raises(ValueError, match=r"table frames: missing columns \['x_px'\]"):
