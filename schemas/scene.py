@@ -194,6 +194,14 @@ class SceneCamera(Group):
             raise ValueError("a camera takes one of fov_deg and focal_px")
         return self
 
+    @model_validator(mode="after")
+    def _terms_of_a_log(self) -> Self:
+        if self.fisheye and (self.p1 or self.p2):
+            raise ValueError("p1 and p2 do not go with a fisheye: its calibration has k1 to k4")
+        if self.k4 and not self.fisheye:
+            raise ValueError("k4 goes with a fisheye: a pinhole's calibration has k1, k2 and k3")
+        return self
+
 
 class Pointing(Group):
     """The pointing of a sensor."""

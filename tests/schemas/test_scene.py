@@ -13,6 +13,10 @@ SHELLS = [SHELL]
 
 BAD_SCENES = {
     "sensors.0.camera: a camera takes one of": {"camera": {"fov_deg": 2.0, "focal_px": 100.0}},
+    "sensors.0.camera: k4 goes with a fisheye": {"camera": {"fov_deg": 2.0, "k4": 0.1}},
+    "sensors.0.camera: p1 and p2 do not go with a fisheye": {
+        "camera": {"fov_deg": 90.0, "fisheye": True, "p2": 0.1}
+    },
     "sensors.0.orbit: the orbit's perigee lies below": {"orbit": {"a_km": 7000.0, "e": 0.5}},
     "sensors.0.orbit: an orbit takes one of": {"orbit": {"a_km": 7000.0, "random": "leo"}},
     "sensors.0.rate_hz = 0: input should be greater": {"rate_hz": 0},
