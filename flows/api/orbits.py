@@ -83,7 +83,7 @@ class ObjectOrbit(NamedTuple):
         Weighted sum of squares, and its degrees of freedom.
     used : (n,) bool
         Which observations were fitted, in the order of the rows; false: of something else, or
-        without one of the numbers of direction, sensor position and their errors.
+        without a time or one of the numbers of direction, sensor position and their errors.
     forces : str
         As in the table `orbits`.
     elements : dict of str to float
@@ -218,7 +218,7 @@ def link(tracklets: pl.DataFrame, settings: Settings | None = None) -> pl.Series
     (36, 0)
     """
     linking = (settings or Settings()).linking
-    rows = tracklets.with_row_index("row")
+    rows = tracklets.drop("row", strict=False).with_row_index("row")
     try:
         if "object_id" not in rows.columns:
             rows = rows.with_columns(object_id=pl.lit(None, pl.String))
@@ -233,9 +233,10 @@ def link(tracklets: pl.DataFrame, settings: Settings | None = None) -> pl.Series
     except pl.exceptions.ColumnNotFoundError as error:
         raise ValueError(f"tracklets: has no column {error}") from error
     label = rows.select("row", label=pl.Series(found.label, dtype=pl.Int64))
-    label = label.with_columns(pl.col("label").rank("dense").cast(pl.Int64) - 1)
     of_rows = tracklets.select(pl.int_range(pl.len(), dtype=pl.UInt32).alias("row"))
-    return of_rows.join(label, on="row", how="left", maintain_order="left")["label"]
+    found_of = of_rows.join(label, on="row", how="left", maintain_order="left")["label"]
+    first = found_of.drop_nulls().unique(maintain_order=True)
+    return found_of.replace_strict(first, pl.int_range(len(first), eager=True), default=None)
 
 
 def fit_orbit(observations: pl.DataFrame, start: npt.ArrayLike | None = None) -> ObjectOrbit:
@@ -282,9 +283,10 @@ def fit_orbit(observations: pl.DataFrame, start: npt.ArrayLike | None = None) ->
     rows = rows.with_columns(object_id=pl.lit("object"), tracklet_id=pl.lit(None, pl.String))
     if isinstance(rows.schema["time"], pl.Datetime):
         rows = rows.with_columns(pl.col("time").dt.cast_time_unit("ns"))
-    rows = rows.filter(pl.all_horizontal(pl.col(_NUMBERS).cast(pl.Float64).is_finite()))
+    known = pl.all_horizontal(pl.col(_NUMBERS).cast(pl.Float64).is_finite())
+    rows = rows.filter(known & pl.col("time").is_not_null())
     if not len(rows):
-        raise ValueError(f"observations: no row has all of {', '.join(_NUMBERS)}")
+        raise ValueError(f"observations: no row has all of {', '.join(_NUMBERS)}, time")
     for name in _SIGMAS:
         if wrong := int((rows[name] <= 0).sum()):
             raise ValueError(f"observations: {name} is not above 0 in {wrong} of {len(rows)} rows")

@@ -114,8 +114,8 @@ def test_a_row_without_a_direction_is_not_fitted():
         api.fit_orbit(rows.with_columns(ra_deg=pl.lit(None, pl.Float64)))
 
 
-@pytest.mark.parametrize("column", ["x_km", "position_sigma_km", "bias_sigma_arcsec"])
-def test_a_row_without_a_sensor_position_or_its_error_is_not_fitted(column):
+@pytest.mark.parametrize("column", ["x_km", "position_sigma_km", "bias_sigma_arcsec", "time"])
+def test_a_row_without_a_sensor_position_its_error_or_a_time_is_not_fitted(column):
     rows = observations(GEO).with_row_index("n")
     gone = rows.with_columns(pl.when(pl.col("n") != 5).then(column).alias(column))
     orbit = api.fit_orbit(gone)
@@ -157,6 +157,15 @@ def test_links_are_numbered_in_the_order_of_their_first_rows():
     # A row without an attributable has no object, and the others stay as they are.
     bare = rows.with_columns(cov_rara=pl.when(pl.int_range(24) != 23).then("cov_rara"))
     assert api.link(bare).to_list() == [*expected[:23], None]
+
+
+def test_links_are_numbered_by_the_rows_whatever_their_order():
+    scene = orbit_tracklets(11, 6, 4, 60.0)
+    rows = pl.DataFrame(rows_of(scene)).with_columns(of=pl.Series(scene.object), row=pl.lit(0))
+    for seed in range(3):
+        mixed = rows.sample(fraction=1.0, shuffle=True, seed=seed)
+        first = list(dict.fromkeys(mixed["of"].to_list()))
+        assert api.link(mixed).to_list() == [first.index(k) for k in mixed["of"].to_list()]
 
 
 def test_known_objects_are_kept_and_links_can_be_refused():
