@@ -109,6 +109,20 @@ def unit_quaternion(name: str, q: Array) -> Array:
     return q
 
 
+def sigma(name: str, value: Any) -> float:
+    """Return a 1-sigma error.
+
+    Raises
+    ------
+    ValueError
+        Where it is not a number, or below 0.
+    """
+    given = float(floats(name, value))
+    if not given >= 0.0:
+        raise ValueError(f"{name}: is {given:g}, expected 0 or more")
+    return given
+
+
 def velocity(velocity_km_s: Any, default: float | None = None) -> Array:
     """Return a sensor's velocity (3,) [km/s]; with `default`, None is that value.
 

@@ -10,6 +10,7 @@ from epipole.flows.api.arguments import (
     Time,
     floats,
     optics,
+    sigma,
     time_ns,
     unit_quaternion,
     velocity,
@@ -230,8 +231,8 @@ def view_frame(
     Raises
     ------
     ValueError
-        Where a shape is wrong, a log with this camera would be refused, or the attitude is not of
-        length 1, as where it is unknown.
+        Where a shape is wrong, a log with this camera would be refused, the attitude is not of
+        length 1, as where it is unknown, or `position_sigma_km` is not a number from 0 on.
 
     Examples
     --------
@@ -260,7 +261,7 @@ def view_frame(
         u_icrs,
         on_tangent_plane(u_icrs, cov),
         floats("position_km", position_km, 3),
-        float(position_sigma_km),
+        sigma("position_sigma_km", position_sigma_km),
         attitude,
         camera,
     )

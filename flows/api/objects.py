@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from epipole.flows.api.arguments import floats, integers, optics
+from epipole.flows.api.arguments import floats, integers, optics, sigma, unit_quaternion
 from epipole.schemas.arrays import Array, Flags, Indices
 from epipole.schemas.settings import Settings
 from epipole.tasks.algorithms.association.samples import Samples
@@ -109,7 +109,8 @@ def associate(views: Sequence[View], settings: Settings | None = None) -> FoundO
     Raises
     ------
     ValueError
-        Where a shape is wrong, or a view has no attitude or camera.
+        Where a shape is wrong, a sigma is below 0, or a view has no attitude of length 1 or no
+        camera.
 
     Notes
     -----
@@ -197,7 +198,8 @@ def triangulate(
     Raises
     ------
     ValueError
-        Where a shape is wrong, or numbers of objects are not whole, or far above their count.
+        Where a shape is wrong, a sigma is below 0, an attitude is not of length 1, or numbers of
+        objects are not whole, or far above their count.
 
     References
     ----------
@@ -254,10 +256,14 @@ def _checked(k: int, view: View) -> View:
         u,
         floats(name + "cov_rad2", view.cov_rad2, len(u), 2, 2, repeat=True),
         floats(name + "position_km", view.position_km, 3),
-        float(view.position_sigma_km),
-        None if attitude is None else floats(name + "attitude_xyzw", attitude, 4),
+        sigma(name + "position_sigma_km", view.position_sigma_km),
+        None if attitude is None else _attitude(name + "attitude_xyzw", attitude),
         None if view.camera is None else optics(name + "camera", view.camera),
     )
+
+
+def _attitude(name: str, xyzw: npt.ArrayLike) -> Array:
+    return unit_quaternion(name, floats(name, xyzw, 4))
 
 
 def _labels(views: Sequence[View], objects: Sequence[npt.ArrayLike] | None) -> Indices:

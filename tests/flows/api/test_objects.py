@@ -81,6 +81,10 @@ def test_no_views_give_no_objects():
         ({"u_icrs": np.ones((2, 3))}, r"views\[0\].u_icrs: are no unit vectors"),
         ({"cov_rad2": np.ones(3)}, r"views\[0\].cov_rad2: has shape \(3,\), expected \(8, 2, 2\)"),
         ({"position_km": [7e3]}, r"views\[0\].position_km: has shape \(1,\), expected \(3,\)"),
+        ({"position_sigma_km": None}, r"views\[0\].position_sigma_km: is nan, expected 0 or"),
+        ({"position_sigma_km": -0.05}, r"views\[0\].position_sigma_km: is -0.05, expected 0 or"),
+        ({"attitude_xyzw": np.full(4, np.nan)}, r"views\[0\].attitude_xyzw: has length nan"),
+        ({"attitude_xyzw": np.ones(4)}, r"views\[0\].attitude_xyzw: has length 2, expected a unit"),
         ({"camera": None}, r"views\[0\]: has no attitude or no camera"),
     ],
 )
