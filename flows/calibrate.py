@@ -84,7 +84,7 @@ def calibration_message(report: CameraReport) -> dict[str, Any]:
     c = report.camera
     assert c is not None
     model, coefficients = distortion_of(c._asdict())
-    return {
+    message = {
         "frame_id": report.sensor_id,
         "width": c.width,
         "height": c.height,
@@ -92,6 +92,7 @@ def calibration_message(report: CameraReport) -> dict[str, Any]:
         "D": [round(v, 9) for v in coefficients],
         "K": [round(v, 3) for v in (c.fx_px, 0.0, c.cx_px, 0.0, c.fy_px, c.cy_px, 0.0, 0.0, 1.0)],
     }
+    return message | ({"line_time_s": c.line_time_s} if c.line_time_s else {})
 
 
 def as_dict(report: CameraReport) -> dict[str, Any]:

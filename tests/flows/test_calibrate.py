@@ -2,7 +2,7 @@
 
 import pytest
 
-from epipole.flows.calibrate import lines
+from epipole.flows.calibrate import calibration_message, lines
 from epipole.tasks.algorithms.geometry.camera import Camera
 from epipole.tasks.calibrate.calibrate_unknown import CameraReport
 
@@ -20,3 +20,10 @@ def test_a_term_that_the_stars_do_not_show_is_not_printed(sigma_k3, says):
     report = CameraReport("a", CAMERA, 1.1, True, True, CAMERA, sigma, 3, 3, 90, 0.1)
     (line,) = (line for line in lines(report) if line.startswith("  distortion"))
     assert line.endswith(f"p1 0.00000 +- 0.00100, p2 0.00000 +- 0.00100, {says}")
+
+
+def test_the_calibration_to_write_has_the_time_from_row_to_row():
+    rolling = CAMERA._replace(line_time_s=-2e-5)
+    for camera, expected in ((rolling, -2e-5), (CAMERA, None)):
+        report = CameraReport("a", camera, 1.1, True, True, camera, {}, 3, 3, 90, 0.1)
+        assert calibration_message(report).get("line_time_s") == expected
