@@ -1,5 +1,6 @@
 """The messages of a span of a night: of each frame, of each epoch, and of what was left out."""
 
+from bisect import bisect_right
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any, NamedTuple, TypeVar
@@ -51,12 +52,23 @@ class SpanTables(NamedTuple):
     positions: pl.DataFrame
 
 
+class ImageShapes(NamedTuple):
+    """The sizes (rows, columns) of a sensor's images, each from a time on, in order of time."""
+
+    since_ns: list[int]
+    sizes: list[tuple[int, int]]
+
+    def at(self, time_ns: int) -> tuple[int, int]:
+        """Return the size at a time; the first one also counts before its time."""
+        return self.sizes[max(bisect_right(self.since_ns, time_ns) - 1, 0)]
+
+
 def frame_messages(
-    tables: SpanTables, star_names: str, shapes: Mapping[str, tuple[int, int]]
+    tables: SpanTables, star_names: str, shapes: Mapping[str, ImageShapes]
 ) -> Iterator[ViewerMessage]:
     """Yield annotations and transforms of all frames.
 
-    `shapes` (rows, columns) are of the sensors whose images are drawn; others get none.
+    `shapes` are of the sensors whose images are drawn; others get none.
     """
     stars = _of_frames(tables.stars, StarSpot)
     detections = _of_frames(tables.detections, DetectedSpot)
@@ -66,7 +78,8 @@ def frame_messages(
         data = annotations(time_ns, *marks, star_names)
         yield ViewerMessage(time_ns, f"/{sensor}/annotations", ANNOTATIONS, data)
         if sensor in shapes:
-            data = _image(time_ns, sensor, shapes[sensor], [*marks[0], *marks[1]])
+            shape = shapes[sensor].at(time_ns)
+            data = _image(time_ns, sensor, shape, [*marks[0], *marks[1]])
             yield ViewerMessage(time_ns, f"/{sensor}/image", IMAGE, data)
         if row["qw"] is not None and row["x_km"] is not None:
             yield ViewerMessage(time_ns, TRANSFORMS, TRANSFORM, transform(time_ns, sensor, row))
@@ -139,11 +152,16 @@ def with_objects(detections: pl.DataFrame, associations: pl.DataFrame) -> pl.Dat
     return detections.join(shown, on="tracklet_id", how="left", maintain_order="left")
 
 
-def camera_shapes(cameras: Any) -> dict[str, tuple[int, int]]:
-    """Return the size (rows, columns) of each sensor's image, of CAMERAS."""
+def camera_shapes(cameras: Any) -> dict[str, ImageShapes]:
+    """Return the sizes of each sensor's images, of CAMERAS."""
     assert cameras.schema.equals(CAMERAS)
-    rows = to_polars(cameras).sort("time").unique("sensor_id", keep="first", maintain_order=True)
-    return {row["sensor_id"]: (row["height"], row["width"]) for row in rows.iter_rows(named=True)}
+    found: dict[str, ImageShapes] = {}
+    rows = _timed(to_polars(cameras), "time").select("sensor_id", "time_ns", "height", "width")
+    for sensor, time_ns, *size in rows.iter_rows():
+        shapes = found.setdefault(sensor, ImageShapes([], []))
+        shapes.since_ns.append(time_ns)
+        shapes.sizes.append((size[0], size[1]))
+    return found
 
 
 def _timed(rows: pl.DataFrame, column: str) -> pl.DataFrame:

@@ -3,6 +3,7 @@
 import datetime
 import json
 import shutil
+import struct
 from collections import Counter, defaultdict
 from pathlib import Path
 
@@ -15,6 +16,7 @@ from mcap_protobuf.decoder import DecoderFactory
 from scipy.spatial.transform import Rotation
 from typer.testing import CliRunner
 
+from epipole.flows import api
 from epipole.flows.command_line.main import app
 from epipole.flows.overlay import overlay
 from epipole.flows.simulate import simulate
@@ -158,6 +160,21 @@ def test_images_show_the_centroids(written):
     assert len(images) == 240
     assert {image.format for image in images} == {"png"}
     assert all(image.data.startswith(b"\x89PNG") for image in images)
+
+
+def test_images_have_the_size_of_the_calibration_at_their_time(night_log, night_dataset, tmp_path):
+    log = api.read_log(night_log)
+    half = log.frames["time"].min() + datetime.timedelta(seconds=30)
+    later = pl.lit(half).cast(log.cameras.schema["time"])
+    binned = log.cameras.filter(sensor_id="sat1").with_columns(time=later, width=256, height=128)
+    cameras = pl.concat([log.cameras, binned.cast(log.cameras.schema)])
+    api.write_log(tmp_path / "b.mcap", log.frames, log.states, cameras)
+    overlay(str(night_dataset), [str(tmp_path / "b.mcap")], tmp_path / "o.mcap", images=True)
+    sizes = defaultdict(set)
+    for topic, time_ns, image in messages(tmp_path / "o.mcap")["foxglove.CompressedImage"]:
+        is_later = time_ns >= half.timestamp() * 1e9
+        sizes[topic == "/sat1/image" and is_later].add(struct.unpack(">II", image.data[16:24]))
+    assert sizes == {False: {(512, 512)}, True: {(256, 128)}}
 
 
 def test_what_is_left_out_is_a_line_of_log(written, night_dataset):
