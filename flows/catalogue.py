@@ -9,7 +9,7 @@ import pyarrow as pa
 
 from epipole.io.catalogues.star_catalogue import write_star_catalogue
 from epipole.io.catalogues.star_list import read_star_list
-from epipole.io.paths import fault_of_name
+from epipole.io.paths import fault_of_name, is_one_of
 from epipole.schemas.bridge import array
 from epipole.schemas.errors import CatalogueError
 from epipole.schemas.options import STAR_CATALOGUES, load_function
@@ -63,7 +63,7 @@ def build_catalogue(
     source
         A name in `STAR_CATALOGUES`, or a CSV or Parquet file of stars.
     out
-        The file to write. An existing file is replaced.
+        The file to write. An existing file is replaced, but for the source.
     epoch, name
         For a file of stars only, see `read_star_list`.
     magnitude_limit
@@ -76,6 +76,8 @@ def build_catalogue(
     """
     if (fault := fault_of_name(out.name)) is not None:
         raise CatalogueError(f"file {out}: {fault}")
+    if source not in STAR_CATALOGUES and is_one_of(out, [source]):
+        raise CatalogueError(f"{out}: is the source, and would be lost; give another file to write")
     if source in STAR_CATALOGUES and (epoch is not None or name is not None):
         raise CatalogueError(f"{source} has an epoch and a name; leave these options out")
     ignored: list[str] = []

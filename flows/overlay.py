@@ -18,6 +18,7 @@ from epipole.io.datasets.rows_by_night import nights_of
 from epipole.io.logs.listing import list_logs
 from epipole.io.logs.reader import read_log_pieces
 from epipole.io.logs.writer import ViewerFile
+from epipole.io.paths import is_one_of
 from epipole.schemas.bridge import array, to_polars
 from epipole.schemas.errors import DatasetError, LogError, NoFramesError
 from epipole.schemas.options import star_ids_of
@@ -86,9 +87,11 @@ def overlay(
     Raises
     ------
     EpipoleError
-        Where the dataset has no night of the logs, or the file cannot be written.
+        Where the dataset has no night of the logs, or the file is one of them or cannot be written.
     """
     paths = [path for where in logs for path in list_logs(where)[0]]
+    if is_one_of(out, paths):
+        raise LogError(f"{out}: is one of the logs, and would be lost; give another file to write")
     given = _Logs(paths)
     nights = [date for date in nights_in(dataset) if date in given.nights and night in (None, date)]
     if not nights:

@@ -211,6 +211,12 @@ def fault_of_name(name: str) -> str | None:
     return None
 
 
+def is_one_of(out: Path, sources: Iterable[str]) -> bool:
+    """Return whether a file to write is one of those that are read: writing would destroy it."""
+    paths = [Path(source) for source in sources if "://" not in source]
+    return out.exists() and any(path.exists() and out.samefile(path) for path in paths)
+
+
 def refuse_device(path: Path) -> None:
     """Raise where a path is a pipe or a device, of which reading may never end.
 

@@ -77,6 +77,15 @@ def test_what_cannot_be_built_is_told_in_one_line_and_nothing_written(
     assert not (tmp_path / "out.parquet").exists()
 
 
+def test_a_list_of_stars_is_not_replaced_by_its_catalogue(epipole, tmp_path):
+    text = "star_id,ra_deg,dec_deg,magnitude\n1,1,1,1\n"
+    (tmp_path / "mine.csv").write_text(text)
+    code, _, err = epipole("catalog", "build", "mine.csv", "--epoch", "2000", "--out", "mine.csv")
+    assert code == 1
+    assert "mine.csv: is the source, and would be lost" in err
+    assert (tmp_path / "mine.csv").read_text() == text
+
+
 def test_a_run_names_a_catalogue_that_is_not_there_before_it_starts(epipole, tmp_path, night_log):
     (tmp_path / "settings.toml").write_text('[identification]\ncatalogue = "none.parquet"\n')
     code, _, err = epipole("run", night_log, "--out", "out", "--settings", "settings.toml")

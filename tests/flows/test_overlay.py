@@ -20,7 +20,7 @@ from epipole.flows import api
 from epipole.flows.command_line.main import app
 from epipole.flows.overlay import overlay
 from epipole.flows.simulate import simulate
-from epipole.schemas.errors import DatasetError, NoFramesError
+from epipole.schemas.errors import DatasetError, LogError, NoFramesError
 from epipole.tasks.overlay.layout import viewer_layout
 
 NIGHT = "2019-04-01"
@@ -229,6 +229,16 @@ def test_a_night_that_the_dataset_does_not_have_is_one_line(night_log, night_dat
     with pytest.raises(DatasetError, match="cannot be written"):
         overlay(str(night_dataset), [str(night_log)], tmp_path / "no" / "x.mcap")
     assert list(tmp_path.iterdir()) == []
+
+
+def test_a_log_is_not_replaced_by_its_overlay(night_log, night_dataset, tmp_path):
+    log = tmp_path / "a.mcap"
+    shutil.copy(night_log, log)
+    (tmp_path / "link.mcap").symlink_to(log)
+    for out in (log, tmp_path / "link.mcap"):
+        with pytest.raises(LogError, match="is one of the logs, and would be lost"):
+            overlay(str(night_dataset), [str(night_log), str(tmp_path)], out)
+    assert log.read_bytes() == night_log.read_bytes()
 
 
 def test_a_night_without_positions_still_has_its_stars(night_log, night_dataset, tmp_path):
