@@ -13,7 +13,7 @@ from epipole.schemas.bridge import concat
 from epipole.schemas.errors import LogError
 from epipole.schemas.log_checks import CheckVerdict, mistakes
 from epipole.schemas.rejects import left_out
-from epipole.schemas.settings import Settings
+from epipole.schemas.settings import EVERY_SENSOR, Settings
 from epipole.schemas.spans import ALL_TIME
 from epipole.schemas.tables import REJECTS
 from epipole.tasks.common.batches import Batch
@@ -33,14 +33,15 @@ NOT_SHOWN = (
 
 
 class Diagnosis(NamedTuple):
-    """What the doctor found: CHECKS of all sensors, counts of what was read, and a sentence for
-    each reason why something was left out."""
+    """What the doctor found: CHECKS of all sensors, counts of what was read, a sentence for each
+    reason why something was left out, and sensors that are assumed on but have nothing here."""
 
     checks: pa.Table
     logs: int
     frames: int
     states: int
     left_out: list[str]
+    assumed_in_vain: list[str]
 
     @property
     def mistakes(self) -> list[str]:
@@ -80,6 +81,7 @@ def doctor(logs: Sequence[str], settings: Settings = Settings()) -> Diagnosis:  
                 "check the recording"
             )
         rejects = concat(REJECTS, [given.rejects, frames.rejects])
+        known = {EVERY_SENSOR, *frames.sensors, *frames.cameras["sensor_id"].to_pylist()}
         checks = judge_logs.fn(
             Batch(judged_sensors(frames)), frames.cameras, rejects, ALL_TIME,
             settings.sensors.state_gap_s,
@@ -90,6 +92,7 @@ def doctor(logs: Sequence[str], settings: Settings = Settings()) -> Diagnosis:  
             frames.n_frames,
             sum(_states(frames, number) for number in range(len(frames.sensors))),
             left_out(rejects),
+            sorted({each.sensor for each in settings.sensors.assume} - known),
         )
 
 
@@ -103,6 +106,7 @@ def as_dict(found: Diagnosis) -> dict[str, Any]:
         "sound": found.is_sound,
         "mistakes": found.mistakes,
         "left_out": found.left_out,
+        "assumed_in_vain": found.assumed_in_vain,
         "logs": found.logs,
         "frames": found.frames,
         "states": found.states,
@@ -115,6 +119,9 @@ def lines(found: Diagnosis) -> list[str]:
     """Return a diagnosis as lines for people: what is wrong first."""
     out = [f"{many(found.frames, 'frame')} and {many(found.states, 'state')} "
            f"in {many(found.logs, 'log')}"]  # fmt: skip
+    if found.assumed_in_vain:
+        names = ", ".join(found.assumed_in_vain)
+        out.append(f"assumed of {names}, of which these logs have nothing: check the id")
     rows = found.checks.to_pylist()
     for sensor in sorted({row["sensor_id"] for row in rows}):
         out.append(sensor)

@@ -93,6 +93,16 @@ def test_logs_without_anything_are_refused(tmp_path):
         doctor([str(tmp_path / "a.mcap")])
 
 
+def test_assumptions_on_sensors_that_logs_do_not_have_are_named(night_log):
+    assumed = ("--assume", "sat9.time=gps", "--assume", "*.time=utc")
+    says = "assumed of sat9, of which these logs have nothing: check the id"
+    assert says in run("doctor", night_log, *assumed).output.splitlines()
+    assert json.loads(run("doctor", night_log, *assumed, "--json").output)["assumed_in_vain"] == [
+        "sat9"
+    ]
+    assert "assumed of" not in run("doctor", night_log, "--assume", "sat1.time=utc").output
+
+
 def test_a_run_warns_of_assumptions_on_sensors_that_logs_do_not_have(
     prefect, night_log, tmp_path, caplog
 ):
