@@ -103,7 +103,7 @@ def identify_frame(
     prior_xyzw : (4,) float, optional
         A prior attitude, sensor from ICRS. None: the whole sky is searched.
     prior_sigma_arcsec : float, optional
-        Its 1-sigma error, per axis. None: that of the settings.
+        Its 1-sigma error, per axis. None, or 0: that of the settings.
     settings : epipole.schemas.settings.Settings, optional
         Those of a run: catalogue, false-alarm probability and so on.
 
@@ -115,8 +115,8 @@ def identify_frame(
     Raises
     ------
     ValueError
-        Where arrays differ in length, a value is not a number, or a log with this camera would be
-        refused.
+        Where arrays differ in length, a value is not a number, `prior_sigma_arcsec` is below 0, or
+        a log with this camera would be refused.
 
     Notes
     -----
@@ -155,7 +155,9 @@ def identify_frame(
     if prior_xyzw is not None:
         unit_quaternion("prior_xyzw", q)
     state |= unstack("q{}", q[None], "xyzw")
-    state["attitude_sigma_arcsec"] = np.array([prior_sigma_arcsec or np.nan], float)
+    known = prior_sigma_arcsec is not None
+    prior_sigma = sigma("prior_sigma_arcsec", prior_sigma_arcsec) if known else 0.0
+    state["attitude_sigma_arcsec"] = np.array([prior_sigma or np.nan])
     states = _one_row(
         SENSOR_STATES_AT_FRAMES, at_ns, **{name: nullable(v) for name, v in state.items()}
     )
