@@ -357,7 +357,7 @@ class AssociationSettings(Group):
         "prior.",
     )
     min_log_odds: float = Field(
-        0.5,
+        2.0,
         ge=-MAX_LOG_ODDS,
         le=MAX_LOG_ODDS,
         description="Minimum log-odds (ln) of a reported object against chance.",
