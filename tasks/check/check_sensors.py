@@ -36,7 +36,7 @@ MAX_EPOCHS = 300  # more do not help: the offset is constant
 MAX_LINES = 30_000  # lines of sight to objects, of all sensors together
 MAX_PAIRS = 100_000  # pairs of a view and an object, per sensor
 KEY = ["epoch", "object_id", "sensor_id"]
-# Minimum number of objects of a sensor that others see too. With three, sensors of which two of five
+# Minimum number of objects of a sensor that others see too. With three, two of five sensors that
 # were wrong, by 1.1 km and 0.34 s, were not judged: positions were 1.5 times as wrong as stated.
 MIN_OBJECTS = 2
 MAX_KNOWN_SIGMA_S = 1.0  # a clock with a larger sigma is unknown

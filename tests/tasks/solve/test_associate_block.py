@@ -24,7 +24,8 @@ from epipole.tasks.solve.associate_block import (
 )
 from epipole.tasks.solve.associate_objects import associate_objects
 
-SETTINGS = Settings()
+# Two sensors and three instants are little evidence.
+SETTINGS = Settings.model_validate({"association": {"min_log_odds": 0.5}})
 BLOCKS = blocks_of(SPAN, SETTINGS.association)
 TIMES = np.array([5.0, 17.0, 29.0, 605.0, 617.0])  # in two blocks
 
