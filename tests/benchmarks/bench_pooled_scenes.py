@@ -1,10 +1,12 @@
 """Random scenes of all kinds, pooled: what is joined wrongly, and are the covariances honest?
 
     python tests/benchmarks/bench_pooled_scenes.py --scenes 60 [--seed 1] [--first 0] [--out FOLDER]
+                                                   [--unlike]
 
 A third are constellations: satellites with two trackers each, fixed to the body. The others are
 those of `bench_real_orbits.py`, geostationary or low, and half of these have one or two sensors at
-fault, by ephemeris, clock or attitude. All are short.
+fault, by ephemeris, clock or attitude. All are short. With --unlike, the sensors of a scene have
+other optics, noise and rates each, and send less (`_unlike`); none of these is a constellation.
 
 A scene is made from its number alone. Log, truth and dataset are kept in FOLDER, so a run that is
 stopped goes on. A line for each scene, with what is wrong in it: ghosts, ids of several objects,
@@ -56,10 +58,12 @@ MIDDLE = datetime(2026, 5, 30, 14, tzinfo=UTC)
 Rng = np.random.Generator
 
 
-def make_log(number: int, low: Orbits, geo: Orbits, seed: int, out: Path) -> tuple[str, Path]:
+def make_log(
+    number: int, low: Orbits, geo: Orbits, seed: int, out: Path, unlike: bool
+) -> tuple[str, Path]:
     """Simulate the scene of this number; return what it is, and its log."""
     rng = np.random.default_rng([seed, number])
-    if number % 3 == 0:
+    if number % 3 == 0 and not unlike:
         near = bool(rng.random() < 0.8)
         size = {
             "satellites": int(rng.integers(*(NEAR_SATELLITES if near else SATELLITES))),
@@ -76,6 +80,8 @@ def make_log(number: int, low: Orbits, geo: Orbits, seed: int, out: Path) -> tup
         kind = "geo" if rng.random() < 0.5 else "low"
         try:
             values = (geo_scene if kind == "geo" else low_scene)(rng, low, geo)
+            if unlike:
+                values["sensors"] = [_unlike(sensor, rng) for sensor in values["sensors"]]
             cadence_s = 1 / min(sensor["rate_hz"] for sensor in values["sensors"])
             values |= {
                 "name": f"{kind}{number}",
@@ -91,6 +97,39 @@ def make_log(number: int, low: Orbits, geo: Orbits, seed: int, out: Path) -> tup
             continue  # no satellites where they are needed: another hour
         return " ".join([f"{kind}{len(values['sensors'])}", *faults]), log
     raise SystemExit(f"scene {number}: no hour has sensors where they are needed")
+
+
+def _unlike(sensor: dict[str, Any], rng: Rng) -> dict[str, Any]:
+    """Return a sensor with other images, optics, noise and rates, of which it sends less."""
+    width, height = int(rng.choice([512, 1024, 2048])), int(rng.choice([512, 1024, 1536]))
+    camera = sensor["camera"] | {"width": width, "height": height}
+    lens = rng.random()
+    if lens < 0.2:
+        camera["k1"] = float(rng.uniform(-0.3, 0.2))
+    elif lens < 0.35:
+        camera["fisheye"] = True
+    if rng.random() < 0.25:
+        cx_px, cy_px = rng.normal(0.0, 3.0, 2).tolist()
+        focal = float(rng.normal(0.0, 0.003))
+        camera["departure"] = {"focal": focal, "cx_px": cx_px, "cy_px": cy_px}
+    if rng.random() < 0.15:
+        camera["line_time_s"] = float(rng.uniform(0.0, 3e-5))
+    detection = sensor["detection"] | {
+        "sigma_px": float(np.exp(rng.uniform(math.log(0.05), math.log(0.8)))),
+        "false_points": float(np.exp(rng.uniform(math.log(0.1), math.log(100.0)))),
+        "faint_sigma_px": float(rng.choice([0.0, 0.0, 0.2, 0.5])),
+        "flux_error": float(rng.uniform(0.02, 0.3)),
+        "send_sigma": bool(rng.random() > 0.2),
+        "send_flux": bool(rng.random() > 0.2),
+    }
+    states = sensor["states"] | {
+        "send_velocity": bool(rng.random() > 0.15),
+        "rate_hz": float(rng.choice([0.1, 0.5, 1.0, 10.0])),
+    }
+    rate_hz = sensor["rate_hz"] * float(rng.choice([0.5, 1.0, 1.0, 1.37, 2.0]))
+    return sensor | {
+        "camera": camera, "detection": detection, "states": states, "rate_hz": rate_hz,
+    }  # fmt: skip
 
 
 def _spoil(values: dict[str, Any], rng: Rng) -> list[str]:
@@ -167,9 +206,11 @@ def _state_errors(states: Any, whose: np.ndarray, judged: np.ndarray, truth: Tru
     return squared_normalised_errors(error, covariance)
 
 
-def run_scene(number: int, low: Orbits, geo: Orbits, seed: int, out: Path) -> dict[str, Any]:
+def run_scene(
+    number: int, low: Orbits, geo: Orbits, seed: int, out: Path, unlike: bool
+) -> dict[str, Any]:
     """Simulate a scene, run it, and return its figures."""
-    what, log = make_log(number, low, geo, seed, out)
+    what, log = make_log(number, low, geo, seed, out, unlike)
     dataset = out / f"{number:04d}.out"
     shutil.rmtree(dataset, ignore_errors=True)
     run = whole_run(log, dataset, {}, lambda _: 0.0)
@@ -241,6 +282,7 @@ def main() -> None:
     parser.add_argument("--scenes", type=int, default=60)
     parser.add_argument("--first", type=int, default=0)
     parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--unlike", action="store_true")
     parser.add_argument("--out", type=Path, default=Path("pooled_scenes"))
     options = parser.parse_args()
     options.out.mkdir(parents=True, exist_ok=True)
@@ -249,7 +291,7 @@ def main() -> None:
     for number in range(options.first, options.first + options.scenes):
         kept = options.out / f"{number:04d}.json"
         if not kept.exists():
-            result = run_scene(number, low, geo, options.seed, options.out)
+            result = run_scene(number, low, geo, options.seed, options.out, options.unlike)
             kept.write_text(json.dumps(result) + "\n")
         results.append(json.loads(kept.read_text()))
         print(line(number, results[-1]), flush=True)

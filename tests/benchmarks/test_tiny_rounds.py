@@ -41,7 +41,7 @@ TINY = {
     "page": "--rounds 1",
     "passages": "--satellites 2 --seeds 1 --seconds 20",
     "photographs": "{folder}/list.csv --width 1024 --height 1024 --field 20 --year 2024 --reach 0",
-    "pooled_scenes": "--first 13 --scenes 1 --out {folder}",
+    "pooled_scenes": "--first 13 --scenes 1 --unlike --out {folder}",
     "positions": "--positions 20",
     "queries": "--nights 10 --rows 1000 --runs 1",
     "real_orbits": f"{ORBITS} --first 4 --scenes 1 --out {{folder}}",
