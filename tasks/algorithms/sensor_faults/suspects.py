@@ -238,8 +238,8 @@ class Agreement(NamedTuple):
     n_in_field : (s,) int
         Objects of at least two other sensors that were in the sensor's field, bright enough for it.
     n_joined : (s,) int
-        Objects among these with a tracklet of the sensor, or with one so near that it may be of
-        the object: where that is not decided, the sensor does not disagree.
+        Objects among these with a tracklet of the sensor, or with an undecided one so near that it
+        may be of the object: then the sensor does not disagree.
     n_unassigned : (s,) int
         Tracklets of the sensor without an object, or with an object of doubted sensors only: their
         tracklets may agree with each other, but with no other sensor's.
@@ -290,10 +290,11 @@ def agreement(samples: Samples, groups: Groups) -> Agreement:
         n_in_field += missed[g] | (others & joined)
         n_joined += others & joined
     found = Agreement(n_in_field, n_joined, np.zeros(n_sensors, np.int64))
+    unclear = groups.undecided | groups.ambiguous
     for sensor in np.flatnonzero(found.doubted).tolist():
         for g in np.flatnonzero(missed[:, sensor]).tolist():
             at = points.r_km[g], points.cov_km2[g]
-            n_joined[sensor] += _has_near(samples, sensor, instant[g], *at)
+            n_joined[sensor] += _has_near(samples, unclear, sensor, instant[g], *at)
     has_members = n_members.astype(bool)[:, ~found.doubted].any(axis=1)
     unassigned = np.append(~has_members, True)  # the last one is FREE
     n_unassigned = np.bincount(samples.sensor[unassigned[groups.group]], minlength=n_sensors)
@@ -327,12 +328,15 @@ def _bright_enough(
     return np.where(judged, expected < faintest - BRIGHTER_MAG, bright)
 
 
-def _has_near(samples: Samples, sensor: int, m: int, x_km: Array, cov_km2: Array) -> bool:
+def _has_near(
+    samples: Samples, unclear: Flags, sensor: int, m: int, x_km: Array, cov_km2: Array
+) -> bool:
     """Return whether a sensor has a tracklet at instant m that may be of the object there.
 
-    `x_km` (3,) and `cov_km2` (3, 3) are the object's position [km], GCRF, and its covariance.
+    `x_km` (3,) and `cov_km2` (3, 3) are the object's position [km], GCRF, and its covariance. Only
+    `unclear` tracklets, (t,) bool, count: they fit some object, with too little evidence.
     """
-    rows = np.flatnonzero((samples.sensor == sensor) & samples.seen[:, m])
+    rows = np.flatnonzero((samples.sensor == sensor) & samples.seen[:, m] & unclear)
     toward = x_km - samples.sensor_km[sensor, m]
     range_km = np.linalg.norm(toward)
     u = samples.u[rows, m]

@@ -202,8 +202,9 @@ def test_a_sensor_whose_tracklets_may_be_of_the_objects_does_not_disagree():
     """In a short window they are often undecided."""
     samples = Scene(6, 4).objects(8, spread_km=100.0).samples()
     groups = solve(samples)
-    undecided = groups._replace(group=np.where(samples.sensor == 3, FREE, groups.group))
-    found = agreement(samples, undecided)
+    groups = groups._replace(group=np.where(samples.sensor == 3, FREE, groups.group))
+    assert agreement(samples, groups).disagreeing().tolist() == [3]
+    found = agreement(samples, groups._replace(undecided=samples.sensor == 3))
     assert found.n_unassigned[3] == 8
     assert found.n_joined[3] == found.n_in_field[3] == 8
     assert found.disagreeing().tolist() == []
