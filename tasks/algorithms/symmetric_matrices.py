@@ -37,12 +37,20 @@ def factor(N, b):
 @kernel
 def solve_factored(L, b):
     """Solve L L^T x = b in place, with the lower factor L (n, n) of `factor`; b (n,) becomes x."""
-    n = len(b)
-    for k in range(n):
+    substitute_forward(L, b)
+    _substitute_back(L, b)
+
+
+@kernel
+def substitute_forward(L, b):
+    """Solve L x = b in place, with the lower factor L (n, n) of `factor`; b (n,) becomes x.
+
+    The square of x is b^T N^-1 b: of a covariance N^-1, the variance along b.
+    """
+    for k in range(len(b)):
         for j in range(k):
             b[k] -= L[k, j] * b[j]
         b[k] /= L[k, k]
-    _substitute_back(L, b)
 
 
 @kernel

@@ -63,8 +63,9 @@ def _solve(views: ObjectViews, reject_sigma: float) -> ViewGroups:
             offsets, views.r_km, views.u, views.cov, views.sigma_km, velocity, reject_sigma
         )
         velocity, spread_s = _velocities(epoch_ns, number, x_km)
-        alone = np.flatnonzero((spread_s == 0.0) & np.isfinite(chi2))
-        velocity[alone] = _velocities_by_rates(views, offsets, alone, x_km, used)
+        alone = (spread_s == 0.0) & np.isfinite(chi2)
+        if alone.any():
+            velocity[alone] = _velocities_by_rates(views, group, alone, x_km, used)
         if not last:
             sigma = np.sqrt(traces(cov_km2) / 3)
             state = np.hstack([x_km, velocity])[group]
@@ -171,24 +172,23 @@ def _velocities(epoch_ns: Indices, number: Indices, x_km: Array) -> tuple[Array,
 
 
 def _velocities_by_rates(
-    views: ObjectViews, offsets: Indices, wanted: Indices, x_km: Array, used: Flags
+    views: ObjectViews, group: Indices, wanted: Flags, x_km: Array, used: Flags
 ) -> Array:
     """Return velocities [km/s] of the wanted groups, by the rates of their used views: (w, 3).
 
     Least squares: each view shows the motion across its line of sight. What none shows stays 0.
+    `group` (n,) is that of each view, `wanted` (g,) bool.
     """
-    of_wanted = np.isin(np.arange(len(x_km)), wanted)
-    group = np.repeat(np.arange(len(x_km)), np.diff(offsets))
     known = views.w.any(axis=1) & np.isfinite(views.v_km_s).all(axis=1)
-    rows = np.flatnonzero(of_wanted[group] & used & known)
-    group = np.searchsorted(wanted, group[rows])
+    rows = np.flatnonzero(wanted[group] & used & known)
+    group = (np.cumsum(wanted) - 1)[group[rows]]
     u, range_km = views.u[rows], lengths(x_km[wanted][group] - views.r_km[rows])
     fitted_s = (views.last_ns[rows] - views.first_ns[rows]) / 1e9
     noise_rad = np.sqrt(traces(views.cov_noise[rows]) / 2)
     sigma_km_s = np.sqrt(12.0) * noise_rad * range_km / np.maximum(fitted_s, 1e-3)
     across = (np.eye(3) - u[:, :, None] * u[:, None, :]) / (sigma_km_s**2)[:, None, None]
-    normal = np.tile(np.eye(3) / ORBITAL_KM_S**2, (len(wanted), 1, 1))
-    right = np.zeros((len(wanted), 3))
+    normal = np.tile(np.eye(3) / ORBITAL_KM_S**2, (wanted.sum(), 1, 1))
+    right = np.zeros((wanted.sum(), 3))
     seen_km_s = range_km[:, None] * views.w[rows] + views.v_km_s[rows]
     np.add.at(normal, group, across)
     np.add.at(right, group, np.einsum("nij,nj->ni", across, seen_km_s))

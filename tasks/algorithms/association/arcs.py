@@ -13,7 +13,7 @@ from epipole.tasks.algorithms.constants import GM_KM3_S2, LN_2PI
 from epipole.tasks.algorithms.earth_gravity import advance
 from epipole.tasks.algorithms.kernels import kernel
 from epipole.tasks.algorithms.orbit_linking.population import COMPONENTS, SHARE, SIGMA
-from epipole.tasks.algorithms.symmetric_matrices import factor
+from epipole.tasks.algorithms.symmetric_matrices import factor, substitute_forward
 
 STEP_S = 60.0  # longest step of the propagation: one of a low orbit errs by 0.1 m
 ITERATIONS = 6  # of Gauss and Newton, at most; three were enough in all scenes tried
@@ -284,10 +284,8 @@ def _is_hyperbolic(state, L):
     for a in range(3):
         slope[a] = GM_KM3_S2 * state[a] / r**3
         slope[3 + a] = state[3 + a]
+    substitute_forward(L, slope)
     for a in range(6):
-        for c in range(a):
-            slope[a] -= L[a, c] * slope[c]
-        slope[a] /= L[a, a]
         variance += slope[a] * slope[a]
     return 0.5 * v2 - GM_KM3_S2 / r > SLACK_SIGMA * np.sqrt(variance)
 
@@ -310,17 +308,15 @@ def _circular_odds(state, L):
         axes[1, 3 + a] = state[3 + a] - radial * axes[0, 3 + a]
         level += axes[1, 3 + a] ** 2
     level = np.sqrt(max(level, 1e-12))
-    circular, S = np.sqrt(GM_KM3_S2 / r), np.zeros((2, 2))
-    for i in range(2):
-        for a in range(3):
-            axes[i, 3 + a] /= level if i else 1.0
-        for a in range(6):
-            for c in range(a):
-                axes[i, a] -= L[a, c] * axes[i, c]
-            axes[i, a] /= L[a, a]
-            S[i, i] += axes[i, a] ** 2
+    for a in range(3):
+        axes[1, 3 + a] /= level
+    circular, S = np.sqrt(GM_KM3_S2 / r), np.zeros((2, 2))  # covariance of the two
+    substitute_forward(L, axes[0])
+    substitute_forward(L, axes[1])
     for a in range(6):
+        S[0, 0] += axes[0, a] ** 2
         S[0, 1] += axes[0, a] * axes[1, a]
+        S[1, 1] += axes[1, a] ** 2
     off, of_component = level - circular, np.empty(COMPONENTS)
     for c in range(COMPONENTS):
         V0, V1 = S[0, 0] + (SIGMA[c] * circular) ** 2, S[1, 1] + (SIGMA[c] * circular) ** 2
