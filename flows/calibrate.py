@@ -106,7 +106,7 @@ def as_dict(report: CameraReport) -> dict[str, Any]:
         "identified": report.n_identified,
         "stars": report.n_stars,
         "residual_px": None if math.isnan(report.residual_px) else report.residual_px,
-        "told": report.nominal._asdict() if report.has_calibration else None,
+        "stated": report.nominal._asdict() if report.has_calibration else None,
         "sigma": report.sigma,
         "calibration": calibration_message(report) if found else None,
     }

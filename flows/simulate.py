@@ -115,6 +115,8 @@ def simulate(
     out = Path(out)
     if (fault := fault_of_name(out.name)) is not None:
         raise SceneError(f"log {out}: {fault}")
+    if not isinstance(scene, Scene) and out.exists() and out.resolve() == Path(scene).resolve():
+        raise SceneError(f"{out}: is the scene itself; give another file for the log")
     is_folder = out.suffix != ".mcap" and any(g.orbit.shells for g in settled.sensors)
     if is_folder and logs > 1:
         raise SceneError(f"logs = {logs}: a folder has one log for each satellite")

@@ -71,8 +71,9 @@ def _parsed(text: str, data: bytes) -> Iterator[ElementSet | Fault]:
         return _messages(_json_messages(text))
     if start == "<":
         return _messages(_xml_messages(data))
-    if "MEAN_MOTION" in text.lstrip().partition("\n")[0]:
-        return _messages(_csv_messages(text))
+    lines = [line for line in text.splitlines() if line.strip() and not line.startswith("#")]
+    if lines and "MEAN_MOTION" in lines[0]:
+        return _messages(_csv_messages(lines))
     return _two_line_sets(text)
 
 
@@ -161,9 +162,9 @@ def _segment_fields(segment: ET.Element) -> dict[str, Any]:
     return {field.tag: field.text for part in parts for field in segment.iterfind(f"{part}/*")}
 
 
-def _csv_messages(text: str) -> Iterator[Mapping[str, Any]]:
+def _csv_messages(lines: Iterable[str]) -> Iterator[Mapping[str, Any]]:
     try:
-        yield from csv.DictReader(text.lstrip().splitlines())
+        yield from csv.DictReader(lines, skipinitialspace=True)
     except csv.Error as error:
         raise CatalogueError(f"not an OMM in CSV: {error}") from error
 

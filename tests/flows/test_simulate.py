@@ -1,5 +1,7 @@
 """Simulated logs and their truth: the same again from the same seed, with what the scene says."""
 
+from pathlib import Path
+
 import numpy as np
 import polars as pl
 import pytest
@@ -16,6 +18,7 @@ from epipole.schemas.errors import SceneError
 from epipole.tasks.evaluate.matching import locate_objects
 
 ARCSEC = np.pi / 648000
+BUILT_IN = Path(__file__).parents[2] / "io" / "simulation" / "built_in"
 
 
 def contents(folder):
@@ -58,6 +61,14 @@ def test_an_option_or_a_place_that_does_not_fit_is_refused(tmp_path):
     (tmp_path / "file").touch()
     with pytest.raises(SceneError, match=r"file/n.mcap: cannot be written"):
         simulate("lost_in_space", tmp_path / "file" / "n.mcap")
+
+
+def test_a_scene_is_not_overwritten_by_its_log(tmp_path):
+    scene = tmp_path / "scene.mcap"
+    scene.write_bytes((BUILT_IN / "lost_in_space.toml").read_bytes())
+    with pytest.raises(SceneError, match="is the scene itself; give another file"):
+        simulate(scene, tmp_path / "." / "scene.mcap")
+    assert scene.read_bytes() == (BUILT_IN / "lost_in_space.toml").read_bytes()
 
 
 def test_states_are_off_by_a_bias_of_each_sensor_and_noise_of_each_state(tmp_path):

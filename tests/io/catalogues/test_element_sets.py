@@ -169,6 +169,13 @@ def test_numbers_may_have_more_than_five_digits(tmp_path):
     assert [each.number for each in known.sets] == [123456, 987654321]
 
 
+def test_a_table_may_have_comments_and_spaces_after_commas(tmp_path):
+    fields = omm()
+    rows = ["# from a web page", "", ", ".join(fields), ", ".join(map(str, fields.values()))]
+    known = read_known_objects(write(tmp_path / "a.csv", "\n".join(rows)))
+    assert ([each.number for each in known.sets], known.faults) == ([25544], [])
+
+
 def test_a_catalogue_of_two_forms_has_those_of_the_first(tmp_path):
     table = omm()
     text = ",".join(table) + "\n" + ",".join(str(v) for v in table.values()) + "\n" + GOOD
