@@ -144,6 +144,16 @@ def one_id(log, names):
     )
 
 
+def exchanged(log, names):
+    """Return the log with the ephemerides of a sensor, or of the first, and the next exchanged."""
+    ids = sorted(set(log.states["sensor_id"].to_pylist()))
+    first = sorted(names)[0]
+    other = ids[(ids.index(first) + len(ids) // 2) % len(ids)]
+    name = pl.col("sensor_id").replace({first: other, other: first})
+    rows = to_polars(log.states).with_columns(sensor_id=name)
+    return log._replace(states=from_polars(LOG_STATES, rows))
+
+
 def scattered(km):
     """Return a mistake: an error of this size in each state, which the sigma does not have."""
 
@@ -217,6 +227,10 @@ MISTAKES = {
     "x and y exchanged": (axes("y x z"), None),
     "z negated": (axes("x y -z"), None),
     "all times as GPS time": (later(18, "frames", "states"), None),
+    "all times an hour late": (later(3600, "frames", "states"), None),
+    "starts of exposures": (starts_of_exposures(1.0), None),
+    "times cut to seconds": (cut("1s"), None),
+    "ephemerides exchanged": (exchanged, None),
     "an ephemeris 1 km off": (
         lambda log, n: states(log, n, x_km=pl.col("x_km") + 1.0, position_sigma_km=pl.lit(0.001)),
         "sigma_too_small",  # a metre is less than the scatter
