@@ -122,6 +122,11 @@ class LogCheck(StrEnum):
         "sensors disagree has it, where who is wrong is not clear.",
         "sensors agree",
     )
+    SENSOR_FAULT = (
+        "sensor_fault",
+        "Error that was added to a sensor at fault, per axis, as large as its fault; only in runs.",
+        "the sensor is not at fault",
+    )
     UTC_TIMES = (
         "utc_times",
         "Written times minus UTC, by satellites of the catalogue; only a run with one compares "
@@ -183,25 +188,17 @@ class LogCause(StrEnum):
         CheckVerdict.UNKNOWN,
         "positions do not fall freely in any frame ({percent:.3g} % of gravity is missing or too "
         "much): thrust, or a mistake that is not known",
-        "",
     )
     ARC_TOO_SHORT = (
         "arc_too_short",
         CheckVerdict.UNKNOWN,
         "the states are too few, too short or too uncertain to tell",
-        "",
     )
-    TOO_FEW_STATES = (
-        "too_few_states",
-        CheckVerdict.UNKNOWN,
-        "the states are too few to tell",
-        "",
-    )
+    TOO_FEW_STATES = "too_few_states", CheckVerdict.UNKNOWN, "the states are too few to tell"
     ON_THE_GROUND = (
         "on_the_ground",
         CheckVerdict.UNKNOWN,
         "the sensor is on the ground or in the air: no orbit shows how its positions are meant",
-        "",
     )
     VELOCITIES_ZERO = (
         "velocities_zero",
@@ -257,14 +254,8 @@ class LogCause(StrEnum):
         CheckVerdict.UNKNOWN,
         "velocities are {value:.3g} km/s off those of the path of positions, which is no clear "
         "mistake",
-        "",
     )
-    NO_VELOCITIES = (
-        "no_velocities",
-        CheckVerdict.UNKNOWN,
-        "no velocities: they come from positions",
-        "",
-    )
+    NO_VELOCITIES = "no_velocities", CheckVerdict.UNKNOWN, "no velocities: they come from positions"
     SIGMA_TOO_SMALL = (
         "sigma_too_small",
         CheckVerdict.WRONG,
@@ -275,7 +266,6 @@ class LogCause(StrEnum):
         "no_sigma",
         CheckVerdict.UNKNOWN,
         "no error of positions is stated; they scatter by {value:.2g} km",
-        "",
     )
     STATES_JUMP = (
         "states_jump",
@@ -284,12 +274,7 @@ class LogCause(StrEnum):
         "km",
         "leave these states out",
     )
-    NO_PATH = (
-        "no_path",
-        CheckVerdict.UNKNOWN,
-        "states follow no smooth path",
-        "",
-    )
+    NO_PATH = "no_path", CheckVerdict.UNKNOWN, "states follow no smooth path"
     VELOCITIES_TOO_FAST = (
         "velocities_too_fast",
         CheckVerdict.WRONG,
@@ -358,7 +343,6 @@ class LogCause(StrEnum):
         CheckVerdict.UNKNOWN,
         "all times of frames are multiples of {value:.1g} s: exposures in step with the clock, or "
         "times that are cut",
-        "",
     )
     FRAMES_AND_STATES_SHIFTED = (
         "frames_and_states_shifted",
@@ -377,7 +361,6 @@ class LogCause(StrEnum):
         "few_states_near",
         CheckVerdict.UNKNOWN,
         "only {percent:.3g} % of the frames have a state near",
-        "",
     )
     NO_STATES = "no_states", CheckVerdict.UNKNOWN, "there are no states: no positions", ""
 
@@ -388,7 +371,6 @@ class LogCause(StrEnum):
         CheckVerdict.WRONG,
         "no frames for {lost_s:,.0f} s of the {length_s:,.0f} s of the night, the longest time "
         "from {gap_from} to {gap_to} UTC",
-        "",
     )
 
     # Of images.
@@ -403,7 +385,6 @@ class LogCause(StrEnum):
         "principal_point_outside",
         CheckVerdict.UNKNOWN,
         "the principal point ({cx_px:.1f}, {cy_px:.1f}) lies outside the image",
-        "",
     )
     WIDTH_AND_HEIGHT_EXCHANGED = (
         "width_and_height_exchanged",
@@ -423,10 +404,9 @@ class LogCause(StrEnum):
         CheckVerdict.UNKNOWN,
         "centroids reach only to ({x_px:.0f}, {y_px:.0f}) in an image of {width:.0f} x "
         "{height:.0f} px: windowed, or pixels that were binned",
-        "",
     )
-    FEW_CENTROIDS = "few_centroids", CheckVerdict.UNKNOWN, "the centroids are too few to tell", ""
-    NO_FLUX = "no_flux", CheckVerdict.UNKNOWN, "no fluxes", ""
+    FEW_CENTROIDS = "few_centroids", CheckVerdict.UNKNOWN, "the centroids are too few to tell"
+    NO_FLUX = "no_flux", CheckVerdict.UNKNOWN, "no fluxes"
     FLUX_IS_MAGNITUDE = (
         "flux_is_magnitude",
         CheckVerdict.WRONG,
@@ -468,14 +448,12 @@ class LogCause(StrEnum):
         "no_centroid_sigma",
         CheckVerdict.UNKNOWN,
         "no errors of centroids are stated: a run learns them from stars",
-        "",
     )
     CENTROID_SIGMA_UNCOMPARED = (
         "centroid_sigma_uncompared",
         CheckVerdict.UNKNOWN,
         "stated errors of centroids are {value:.2g} px; only a run with identified stars "
         "compares them",
-        "",
     )
 
     # Of lines of sight: with another reading they meet.
@@ -519,14 +497,33 @@ class LogCause(StrEnum):
         CheckVerdict.UNKNOWN,
         "{percent:.3g} % of its views meet those of other sensors, and no ordinary mistake "
         "explains it: they look at other objects, or the mistake is not known",
-        "",
     )
     VIEWS_TOO_VAGUE = (
         "views_too_vague",
         CheckVerdict.UNKNOWN,
         "{percent:.0f} % of its views meet those of other sensors, but {share_percent:.0f} % would "
         "without a common object: they are many, or their errors are large",
-        "",
+    )
+    CLOCK_OFF = (
+        "clock_off",
+        CheckVerdict.WRONG,
+        "lines of sight meet those of other sensors if its clock is {size:+.3f} s (sigma "
+        "{size_sigma:.3f} s) off: {value:.2g} km of it per axis are left in its positions",
+        "compare its clock; `alignment.correct_clocks` takes the offset off",
+    )
+    EPHEMERIS_OFF = (
+        "ephemeris_off",
+        CheckVerdict.WRONG,
+        "lines of sight meet those of other sensors if its ephemeris is {size:.2f} km (sigma "
+        "{size_sigma:.2f} km) off: its views were moved so, within {value:.2g} km per axis",
+        "compare its ephemeris, frame of reference and times of states",
+    )
+    ATTITUDE_OFF = (
+        "attitude_off",
+        CheckVerdict.WRONG,
+        "lines of sight meet those of other sensors if its prior attitudes are {size:.1f} arcsec "
+        "(sigma {size_sigma:.1f} arcsec) off: its views were turned so, within {value:.2g} arcsec",
+        "compare its attitudes and how the sensor is mounted",
     )
     SENSORS_IN_DOUBT = (
         "sensors_in_doubt",
@@ -567,16 +564,20 @@ class LogCause(StrEnum):
         "few_known_satellites",
         CheckVerdict.UNKNOWN,
         "{known:.0f} of {tracklets:.0f} tracklets are known satellites, which is too few to tell",
-        "",
     )
 
 
 LISTED = 4  # sensors that a sentence names
+OF_ONE_SENSOR = (
+    LogCause.LONG_GAPS, LogCause.CLOCK_OFF, LogCause.EPHEMERIS_OFF, LogCause.ATTITUDE_OFF,
+)  # fmt: skip
 MISTAKE_COLUMNS = ("sensor_id", "check", "verdict", "cause", "sentence")
 
 
 def mistakes(checks: Iterable[Mapping[str, Any]]) -> list[str]:
-    """Return a sentence for each mistake, with the sensors that have it; of gaps, each has one.
+    """Return a sentence for each mistake, with the sensors that have it.
+
+    Gaps, and faults of sensors, have a sentence each.
 
     Parameters
     ----------
@@ -587,8 +588,7 @@ def mistakes(checks: Iterable[Mapping[str, Any]]) -> list[str]:
     sentences: dict[tuple[str, str], str] = {}
     for row in checks:
         if row["verdict"] == CheckVerdict.WRONG:
-            of_gaps = row["cause"] == LogCause.LONG_GAPS
-            key = (row["check"], row["sentence"] if of_gaps else row["cause"])
+            key = (row["check"], row["sentence" if row["cause"] in OF_ONE_SENSOR else "cause"])
             sensors.setdefault(key, []).append(row["sensor_id"])
             sentences.setdefault(key, row["sentence"])
     return [f"{_listed(sensors[key])}: {sentence}" for key, sentence in sentences.items()]

@@ -353,20 +353,21 @@ class Reason(StrEnum):
     CLOCK_OFF = (
         "clock_off",
         Stage.CHECK,
-        "The sensor's clock is wrong and was not corrected; its views are left out.",
+        "The sensor's clock is wrong, too far for its views to be used; they are left out.",
         Trait.SENSOR_FAULT | Trait.SUMMED,
     )
     EPHEMERIS_OFF = (
         "ephemeris_off",
         Stage.CHECK,
-        "The sensor's ephemeris is wrong; its attitude is right, by stars or by the other lines of "
-        "sight; its views are left out.",
+        "The sensor's ephemeris is wrong, too far for its views to be used; its attitude is right, "
+        "by stars or by the other lines of sight; its views are left out.",
         Trait.SENSOR_FAULT,
     )
     ATTITUDE_OFF = (
         "attitude_off",
         Stage.CHECK,
-        "The sensor's prior attitudes are wrong; its views are left out.",
+        "The sensor's prior attitudes are wrong, too far for its views to be used; they are left "
+        "out.",
         Trait.SENSOR_FAULT,
     )
     DISAGREES = (

@@ -293,9 +293,9 @@ class AlignmentSettings(Group):
         "frame interval or half the interval between epochs, whichever is longer.",
     )
     correct_clocks: bool = Field(
-        False,
+        True,
         description="What to do with a sensor whose clock is certainly wrong: true corrects the "
-        "times of its frames, false leaves the sensor out.",
+        "times of its frames, false adds an error as large to its positions.",
     )
 
 

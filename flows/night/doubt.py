@@ -15,13 +15,13 @@ import pyarrow.compute as pc
 from epipole.flows.night.stages import Checked, check, solve
 from epipole.flows.night.summary import many
 from epipole.flows.night.work import Work
-from epipole.io.work.work_layout import SolvedParts
+from epipole.io.work.work_layout import AddedErrors, SensorFault, SolvedParts
 from epipole.schemas.bridge import array
 from epipole.schemas.rejects import Reason
 from epipole.schemas.settings import Settings
 from epipole.tasks.algorithms.constants import SECOND_NS
 from epipole.tasks.algorithms.sensor_faults.fault_judgement import LEAST_AGREEING, SOUND, Doubt
-from epipole.tasks.check.check_sensors import SensorVerdict
+from epipole.tasks.check.check_sensors import SPEED_KM_S, SensorVerdict
 
 LOGGER = logging.getLogger(__name__)
 
@@ -30,9 +30,6 @@ WIDE_KM = 10.0  # error with which all sensors take part, to learn how far they 
 # is off by as much. With 1, half of the positions lay outside their 99 % ellipsoids then; with 2
 # and 3, none.
 MARGIN = 2.0
-# Of low satellites. What all clocks share shifts sensors alongside each other alike, and objects:
-# their lines of sight show a part of it.
-SPEED_KM_S = 7.6
 # Of errors larger than stated, which are nobody's in particular. Sound scenes have up to 1.4.
 MIN_LOG_ODDS = 6.0
 
@@ -59,24 +56,66 @@ def settle(work: Work, solved: SolvedParts, checked: Checked, settings: Settings
     """
     window_s = settings.association.window_s
     if not in_doubt(checked.work, solved, checked, window_s):
-        if checked.left_out:
-            solved = solve(work, settings, checked.left_out)
-        return Settled(checked.work, solved, clocks=_clocks(checked.work))
-    wide = solve(work, settings, more_km=WIDE_KM)
+        checked = _judge_left_out(work, solved, checked, settings)
+        return _solve_with_faults(work, solved, checked, settings)
+    wide = solve(work, settings, added=AddedErrors(WIDE_KM))
     judged = check(work, wide, settings, correct=False)
     clocks = _clocks(judged.work)
     if judged.left_out and not in_doubt(judged.work, wide, judged, window_s):
-        solved = solve(work, settings, judged.left_out)
-        if not in_doubt(judged.work, solved, judged, window_s):
-            return Settled(judged.work, solved, clocks=clocks)
+        settled = _solve_with_faults(work, wide, judged, settings)
+        if not in_doubt(judged.work, settled.solved, judged, window_s):
+            return settled
     more_km = _error_km(checked.doubt, judged.doubt)
     LOGGER.warning(
         "sensors disagree, and who is wrong is not clear: an error of %.2g km per axis is added "
         "to the positions of all %s", more_km, many(len(work.spans), "sensor"),
     )  # fmt: skip
     unnamed = tuple(one._replace(cause=SOUND) for one in judged.work.verdicts)
-    solved = solve(work, settings, more_km=more_km)
+    solved = solve(work, settings, added=AddedErrors(more_km))
     return Settled(judged.work._replace(verdicts=unnamed), solved, judged.doubt, clocks)
+
+
+def _judge_left_out(
+    work: Work, solved: SolvedParts, checked: Checked, settings: Settings
+) -> Checked:
+    """Return the check with verdicts on sensors that are so wrong that they join no objects.
+
+    Parameters are those of `settle`. Such sensors take part with a wide error. The check stays as
+    it is if others are at fault then, or it is not clear who is.
+    """
+    window_s = settings.association.window_s
+    named = {one.sensor_id for one in checked.work.verdicts if one.is_faulty}
+    sides = _sides(work, solved, window_s)
+    apart = (sides.disagree | sides.unclear) - named
+    if not apart:
+        return checked
+    suspects = sorted(apart | set(checked.left_out))
+    wide = solve(
+        work, settings,
+        added=AddedErrors(faults=tuple(SensorFault(s, WIDE_KM, left_km=WIDE_KM) for s in suspects)),
+    )  # fmt: skip
+    judged = check(work, wide, settings, correct=False)
+    faulty = {one.sensor_id for one in judged.work.verdicts if one.is_faulty}
+    is_clear = not in_doubt(judged.work, wide, judged, window_s)
+    as_before = (
+        faulty <= named.union(suspects) and judged.left_out.keys() >= checked.left_out.keys()
+    )
+    return judged if is_clear and as_before else checked
+
+
+def _solve_with_faults(
+    work: Work, solved: SolvedParts, checked: Checked, settings: Settings
+) -> Settled:
+    """Solve a night with sensors at fault: their errors are as large as their faults.
+
+    Those of which this is not known are left out. Parameters are those of `settle`.
+    """
+    faults = tuple(fault for one in checked.work.verdicts if (fault := one.fault()) is not None)
+    taking_part = {fault.sensor_id for fault in faults}
+    left_out = {name: why for name, why in checked.left_out.items() if name not in taking_part}
+    if faults or left_out:
+        solved = solve(work, settings, left_out, AddedErrors(faults=faults))
+    return Settled(checked.work, solved, clocks=_clocks(checked.work))
 
 
 def _error_km(*doubts: Doubt) -> float:
@@ -99,20 +138,26 @@ def in_doubt(work: Work, solved: SolvedParts, checked: Checked, window_s: float)
     doubt = checked.doubt
     if doubt.undecided or np.isfinite(doubt.shared_s) or doubt.spread_log_odds > MIN_LOG_ODDS:
         return True
-    agree, disagree = _sides(work, solved, window_s)
+    agree, disagree, _ = _sides(work, solved, window_s)
     late = {one.sensor_id for one in _clocks(checked.work)}
     faulty = {name for name, why in checked.left_out.items() if why != Reason.CLOCK_OFF}
     agree, disagree = agree - set(checked.left_out) - late, (disagree - late) | faulty
     return bool(disagree) and len(agree) < max(len(disagree) + 1, LEAST_AGREEING)
 
 
-def _sides(work: Work, solved: SolvedParts, window_s: float) -> tuple[set[str], set[str]]:
-    """Return the sensors that have objects with others, and those mostly left out at that.
+class _Sides(NamedTuple):
+    """Sensors that have objects with others, those mostly left out at that, and those of the first
+    whose tracklets mostly may be of an object, or not."""
 
-    Both are counted by tracklets and windows of association, of `window_s` [s].
-    """
+    agree: set[str]
+    disagree: set[str]
+    unclear: set[str]
+
+
+def _sides(work: Work, solved: SolvedParts, window_s: float) -> _Sides:
+    """Return who agrees with whom, by tracklets and windows of association, of `window_s` [s]."""
     names = {sensor.number: sensor.sensor_id for sensor in work.spans}
-    joined, left_out = dict.fromkeys(names.values(), 0), dict.fromkeys(names.values(), 0)
+    joined, left_out, unclear = (dict.fromkeys(names.values(), 0) for _ in range(3))
     for span in work.all_spans():
         if not solved.holds(span):
             continue
@@ -124,11 +169,17 @@ def _sides(work: Work, solved: SolvedParts, window_s: float) -> tuple[set[str], 
         count = np.bincount(array(members, "sensor"), last - first + 1)
         for number in np.flatnonzero(count).tolist():
             joined[names[number]] += int(count[number])
+        counted = {Reason.SENSOR_DISAGREES: left_out, Reason.UNDECIDED: unclear}
         for rows in solved.of_blocks(span, "rejects"):
-            rows = rows.filter(pc.equal(rows["reason"], Reason.SENSOR_DISAGREES.value))
-            for name, count in zip(
-                rows["sensor_id"].to_pylist(), rows["count"].to_pylist(), strict=True
-            ):
-                left_out[name] += count
+            for reason, of_reason in counted.items():
+                found = rows.filter(pc.equal(rows["reason"], reason.value))
+                for name, count in zip(
+                    found["sensor_id"].to_pylist(), found["count"].to_pylist(), strict=True
+                ):
+                    of_reason[name] += count
     disagree = {name for name, count in left_out.items() if count > joined[name]}
-    return {name for name, count in joined.items() if count} - disagree, disagree
+    return _Sides(
+        {name for name, count in joined.items() if count} - disagree,
+        disagree,
+        {name for name, count in unclear.items() if count > joined[name]} - disagree,
+    )

@@ -20,7 +20,7 @@ from epipole.schemas.spans import DAY_NS, SPAN_NS, day_of
 from epipole.schemas.stages import Stage
 from epipole.schemas.tables import CHECKS
 from epipole.tasks.calibrate.judge_star_scatter import judge_star_scatter
-from epipole.tasks.check.judge_doubt import doubt_table, name_cut_times
+from epipole.tasks.check.judge_doubt import doubt_table, fault_table, name_cut_times
 from epipole.tasks.check.judge_readings import judge_readings
 from epipole.tasks.common.batches import in_batches
 from epipole.tasks.read.judge_logs import (
@@ -100,11 +100,14 @@ def check_readings(settled: Settled, frames: OrderedFrames, checks: pa.Table) ->
     work, doubt = settled.work, settled.doubt
     viewed = work.folder.viewed(work.round)
     checks = name_cut_times(checks, settled.clocks, doubt)
-    judged = judge_readings.submit(viewed, list(work.spans), work.all_spans())
+    faulty = {one.sensor_id for one in work.verdicts if one.is_faulty or doubt is not None}
+    judged = judge_readings.submit(viewed, list(work.spans), work.all_spans(), faulty)
     (found,) = results(Stage.CHECK, [judged])
+    added = settled.solved.added
     if doubt is not None:
         exposure_s = {each.sensor_id: _exposure_s(frames, each.number) for each in work.spans}
-        found = concat(CHECKS, [found, doubt_table(doubt, settled.solved.more_km, exposure_s)])
+        found = concat(CHECKS, [found, doubt_table(doubt, added.km, exposure_s)])
+    found = concat(CHECKS, [found, fault_table(work.verdicts, added)])
     return concat(CHECKS, [checks, _with_warnings(found)])
 
 

@@ -15,7 +15,12 @@ import pyarrow as pa
 
 from epipole.flows.night.progress import results
 from epipole.flows.night.work import Work
-from epipole.io.work.work_layout import SolvedParts, ViewedParts
+from epipole.io.work.work_layout import (
+    NOTHING_ADDED,
+    AddedErrors,
+    SolvedParts,
+    ViewedParts,
+)
 from epipole.schemas.bridge import array
 from epipole.schemas.rejects import Reason
 from epipole.schemas.settings import Settings
@@ -81,11 +86,14 @@ class _Night(NamedTuple):
 
 
 def solve_objects(
-    work: Work, settings: Settings, left_out: Mapping[str, Reason], more_km: float = 0.0
+    work: Work,
+    settings: Settings,
+    left_out: Mapping[str, Reason],
+    added: AddedErrors = NOTHING_ADDED,
 ) -> tuple[SolvedParts, int]:
     """Find and solve the objects of all sensors but those left out.
 
-    With `more_km`, the positions of all sensors have this error more, 1-sigma per axis.
+    Sensors have the errors `added` beside the stated ones.
 
     Returns
     -------
@@ -94,7 +102,7 @@ def solve_objects(
     count
         Number of positions.
     """
-    solved = work.folder.solved(work.round, not left_out, more_km)
+    solved = work.folder.solved(work.round, not left_out, added)
     grid = epoch_grid(work, settings)
     night = _Night(list(work.spans), work.all_spans(), grid, work, settings, solved)
     n_views = _view(night)
@@ -159,7 +167,7 @@ def _associate(night: _Night, n_views: Mapping[Span, int], left_out: Mapping[str
                 associate_blocks.submit(
                     night.sensors, night.viewed, of_task, night.work.cameras, left_out,
                     night.settings.association, night.settings.alignment.window_s,
-                    night.settings.work.max_views, night.solved.blocks, night.solved.more_km,
+                    night.settings.work.max_views, night.solved.blocks, night.solved.added,
                 )
             )  # fmt: skip
     results(Stage.SOLVE, futures, (1, STEPS))

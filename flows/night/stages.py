@@ -20,7 +20,13 @@ from epipole.flows.night.summary import Summary, many, summarise
 from epipole.flows.night.work import Spans, Work, count_frames, spans_of_night
 from epipole.io.catalogues.element_sets import KnownObjects
 from epipole.io.work.parts import IDENTIFIED, Parts, write_part
-from epipole.io.work.work_layout import ReadFolder, SolvedParts, WorkFolder
+from epipole.io.work.work_layout import (
+    NOTHING_ADDED,
+    AddedErrors,
+    ReadFolder,
+    SolvedParts,
+    WorkFolder,
+)
 from epipole.schemas.bridge import array, concat, to_polars
 from epipole.schemas.rejects import ObjectVerdict, Reason
 from epipole.schemas.settings import EVERY_SENSOR, Settings
@@ -147,10 +153,10 @@ def solve(
     work: Work,
     settings: Settings,
     left_out: Mapping[str, Reason] | None = None,
-    more_km: float = 0.0,
+    added: AddedErrors = NOTHING_ADDED,
 ) -> SolvedParts:
     """Find and solve objects, from all sensors but those left out; see `solve_objects`."""
-    solved, count = solve_objects(work, settings, left_out or {}, more_km)
+    solved, count = solve_objects(work, settings, left_out or {}, added)
     LOGGER.info("solved %s", many(count, "position"))
     return solved
 
@@ -179,7 +185,8 @@ def check(work: Work, solved: SolvedParts, settings: Settings, correct: bool = T
     late = [verdict for verdict in faulty if verdict.has_wrong_clock]
     work = work._replace(verdicts=tuple(add_corrections(work.verdicts, verdicts)))
     correctable = correct and settings.alignment.correct_clocks and work.round < MAX_CORRECTIONS
-    if late and correctable:
+    is_clear = not doubt.undecided and np.isnan(doubt.shared_s)
+    if late and correctable and is_clear:
         return Checked(_correct_clocks(work, late, settings), True, {}, doubt)
     return Checked(work, False, _taking_part(work, solved, faulty), doubt)
 

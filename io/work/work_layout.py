@@ -13,7 +13,8 @@ Parts of reading belong to a run; all others to the nights and a key (see `folde
     track/0/0-names/1554091200    the names of these tracklets in the night
     track/0/0-names/night         all tracklets of the sensor's night
     solve/0/views/0/1554091200    views of sensor 0, before any check
-    solve/0/all/...               of all sensors; solve/0/some/... without those left out:
+    solve/0/all/...               of all sensors; solve/0/some/... without those left out;
+                                  others for each set of errors that are added:
         blocks/1554091200         objects of the block of time that begins at this second
         objects/1554091200        the objects of the span, each with its views and its piece
         errors/1554091200         sensors whose shared errors are larger than stated
@@ -22,10 +23,12 @@ Parts of reading belong to a run; all others to the nights and a key (see `folde
         linked_pieces/...         pieces of these objects
 """
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
+from zlib import crc32
 
 import pyarrow as pa
 
@@ -34,6 +37,56 @@ from epipole.schemas.bridge import concat
 from epipole.schemas.spans import Sensor, Span
 from epipole.schemas.stages import Stage
 from epipole.schemas.work_tables import SHARED_ERRORS
+
+
+class SensorFault(NamedTuple):
+    """A fault of a sensor that takes part; errors are 1-sigma per axis.
+
+    km, rad
+        Errors of its positions and attitudes as large as the fault, as logs have them.
+    bias_km, bias_rad
+        Errors that are known, reported minus true, GCRF; the second is a rotation vector.
+    left_km, left_rad
+        Errors that are left where these are taken off.
+    """
+
+    sensor_id: str
+    km: float = 0.0
+    rad: float = 0.0
+    bias_km: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    bias_rad: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    left_km: float = 0.0
+    left_rad: float = 0.0
+
+
+class AddedErrors(NamedTuple):
+    """Errors with which sensors take part beside the stated ones.
+
+    km
+        Of the positions of all sensors, 1-sigma per axis.
+    faults
+        Of some sensors.
+    """
+
+    km: float = 0.0
+    faults: tuple[SensorFault, ...] = ()
+
+    def of(self, sensor_id: str) -> SensorFault:
+        """Return the fault of a sensor, with `km` in its errors; a sound one has only these."""
+        found = {fault.sensor_id: fault for fault in self.faults}
+        fault = found.get(sensor_id, SensorFault(sensor_id))
+        return fault._replace(
+            km=math.hypot(self.km, fault.km), left_km=math.hypot(self.km, fault.left_km)
+        )
+
+    @property
+    def label(self) -> str:
+        """A part of the name of a folder; other errors have another one."""
+        whole = f"-{self.km:g}-km" if self.km else ""
+        return whole + (f"-{crc32(repr(self.faults).encode()):08x}" if self.faults else "")
+
+
+NOTHING_ADDED = AddedErrors()
 
 
 class ReadFolder(NamedTuple):
@@ -85,13 +138,12 @@ class WorkFolder(NamedTuple):
         """Return the parts with the views of all sensors."""
         return ViewedParts(self.root / Stage.SOLVE / str(round_) / "views", self.kept)
 
-    def solved(self, round_: int, all_sensors: bool = True, more_km: float = 0.0) -> "SolvedParts":
-        """Return the parts of `solve`: of all sensors, or without those left out.
-
-        `more_km` is that of the parts.
-        """
-        which = ("all" if all_sensors else "some") + (f"-{more_km:g}-km" if more_km else "")
-        return SolvedParts(self.root / Stage.SOLVE / str(round_) / which, more_km, self.kept)
+    def solved(
+        self, round_: int, all_sensors: bool = True, added: AddedErrors = NOTHING_ADDED
+    ) -> "SolvedParts":
+        """Return the parts of `solve`: of all sensors, or without those left out."""
+        which = ("all" if all_sensors else "some") + added.label
+        return SolvedParts(self.root / Stage.SOLVE / str(round_) / which, added, self.kept)
 
 
 @dataclass(frozen=True)
@@ -109,13 +161,12 @@ class ViewedParts:
 class SolvedParts(NamedTuple):
     """Where `solve` puts what it finds of the objects of all sensors.
 
-    The positions of all sensors get the error `more_km`, 1-sigma per axis, beside the stated one.
-    With `linked`, parts are of objects with the tracklets that an orbit joins to them; pieces in
-    which it joins none are those of before.
+    Sensors have the errors `added` beside the stated ones. With `linked`, parts are of objects with
+    the tracklets that an orbit joins to them; pieces in which it joins none are those of before.
     """
 
     root: Path
-    more_km: float = 0.0
+    added: AddedErrors = NOTHING_ADDED
     kept: Path | None = None  # the folder of the parts of other runs, by key
     linked: bool = False
 

@@ -9,7 +9,7 @@ import polars as pl
 import pyarrow as pa
 
 from epipole.io.work.parts import Parts
-from epipole.io.work.work_layout import SolvedParts, ViewedParts
+from epipole.io.work.work_layout import SensorFault, SolvedParts, ViewedParts
 from epipole.schemas.arrays import Array
 from epipole.schemas.bridge import array, concat, stack, stack_covariance, to_polars
 from epipole.schemas.columns import TANGENT_AXES
@@ -40,6 +40,14 @@ KEY = ["epoch", "object_id", "sensor_id"]
 # were wrong, by 1.1 km and 0.34 s, were not judged: positions were 1.5 times as wrong as stated.
 MIN_OBJECTS = 2
 MAX_KNOWN_SIGMA_S = 1.0  # a clock with a larger sigma is unknown
+# Of low satellites: what a wrong clock shifts a sensor, and its objects, by.
+SPEED_KM_S = 7.6
+# Of low satellites. What is wrong along an orbit, or with the axes of a body, turns with it: a bias
+# that was found constant in inertial axes is left by this angle times its size.
+TURN_RAD_S = 1.1e-3
+# Maximum of the errors with which a sensor at fault takes part: with larger ones its lines of sight
+# meet any others.
+MAX_ADDED_KM, MAX_ADDED_RAD = 10.0, 600 * ARCSEC
 
 
 # The reasons for which a sensor is left out, by its fault.
@@ -56,7 +64,8 @@ class SensorVerdict(NamedTuple):
 
     `offset_s` is the offset [s], reported minus true time, `sigma_s` its 1-sigma error. `cause` is
     the declared fault, '' for a sound sensor. `size` and `size_sigma` are the size of a wrong
-    ephemeris [km] or attitude [rad] and its 1-sigma error.
+    ephemeris [km] or attitude [rad] and its 1-sigma error; `bias` and `bias_sigma` are those of
+    `JudgedSensors`. The offset of a clock that is `corrected` was taken off.
     """
 
     sensor_id: str
@@ -65,6 +74,9 @@ class SensorVerdict(NamedTuple):
     cause: str = SOUND
     size: float = 0.0
     size_sigma: float = 0.0
+    bias: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    bias_sigma: float = 0.0
+    corrected: bool = False
 
     @property
     def has_wrong_clock(self) -> bool:
@@ -75,6 +87,27 @@ class SensorVerdict(NamedTuple):
     def is_faulty(self) -> bool:
         """Whether a fault is declared."""
         return self.cause != SOUND
+
+    def fault(self) -> SensorFault | None:
+        """Return the fault with which the sensor takes part.
+
+        Errors as large as the fault are per axis; only what is across a line of sight counts, on
+        two axes. A wrong clock moves each line by another amount: it is not taken off. None where
+        the kind of the fault is not known, it is too large, or corrected.
+        """
+        if self.corrected:
+            return None
+        size = math.hypot(self.size, self.bias_sigma) / math.sqrt(2.0)
+        moved_km = SPEED_KM_S * math.hypot(self.offset_s, self.sigma_s)
+        if self.cause == EPHEMERIS and size < MAX_ADDED_KM:
+            return SensorFault(self.sensor_id, km=size, bias_km=self.bias, left_km=self.bias_sigma)
+        if self.cause == ATTITUDE and size < MAX_ADDED_RAD:
+            return SensorFault(
+                self.sensor_id, rad=size, bias_rad=self.bias, left_rad=self.bias_sigma
+            )
+        if self.cause == CLOCK and moved_km < MAX_ADDED_KM:
+            return SensorFault(self.sensor_id, km=moved_km, left_km=moved_km)
+        return None
 
     def __str__(self) -> str:
         """Return the verdict as a sentence."""
@@ -225,14 +258,32 @@ def sensor_verdicts(
         bias["attitude_sigma_rad"].to_numpy(),
         np.array([guess.get(name, 0.0) for name in bias["sensor_id"]]),
     )
+    drift = TURN_RAD_S / math.sqrt(12.0) * _seconds(rows)
+    left = np.hypot(judged.bias_sigma, judged.size * np.minimum(drift, 1.0))
     verdicts = [
-        SensorVerdict(name, float(offset), float(sigma), cause, float(size), float(size_sigma))
-        for name, offset, sigma, cause, size, size_sigma in zip(
-            bias["sensor_id"], *judged[:5], strict=True
+        SensorVerdict(
+            name,
+            float(offset),
+            float(sigma),
+            cause,
+            float(size),
+            float(size_sigma),
+            (float(off[0]), float(off[1]), float(off[2])),
+            float(off_sigma),
+        )
+        for name, offset, sigma, cause, size, size_sigma, off, off_sigma in zip(
+            bias["sensor_id"], *judged[:6], left, strict=True
         )
     ]
     known = [one for one in verdicts if one.sigma_s < MAX_KNOWN_SIGMA_S or one.is_faulty]
     return JudgedSights(known, judged.doubt)
+
+
+def _seconds(rows: pl.DataFrame) -> Array:
+    """Return for how long each sensor has views of objects [s], in the order of their ids."""
+    last = pl.col("epoch").max() - pl.col("epoch").min()
+    seconds = rows.group_by("sensor_id").agg(s=last.dt.total_microseconds() / 1e6)
+    return seconds.sort("sensor_id")["s"].to_numpy()
 
 
 def _with_enough_objects(rows: pl.DataFrame) -> pl.DataFrame:
@@ -347,11 +398,16 @@ def add_corrections(
         verdict._replace(
             offset_s=verdict.offset_s + corrected[verdict.sensor_id].offset_s,
             cause=verdict.cause or CLOCK,
+            corrected=True,
         )
         if verdict.sensor_id in corrected
         else verdict
         for verdict in now
     ]
     judged = {verdict.sensor_id for verdict in now}
-    total += [verdict for name, verdict in corrected.items() if name not in judged]
+    total += [
+        verdict._replace(corrected=True)
+        for name, verdict in corrected.items()
+        if name not in judged
+    ]
     return sorted(total)

@@ -32,7 +32,7 @@ from epipole.tasks.algorithms.geometry.directions import (
     radec_from_unit,
     unit_from_radec,
 )
-from epipole.tasks.check.check_sensors import SensorVerdict
+from epipole.tasks.check.check_sensors import SPEED_KM_S, SensorVerdict
 from epipole.tasks.common.stage_tasks import stage_task
 from epipole.tasks.identify.frame_inputs import interpolate_sensor_states
 from epipole.tasks.identify.identify_span import states_about, without_state
@@ -69,11 +69,21 @@ def correct_clock(
     names = ("solutions", "stars", "detections")
     tables = {name: at_true_times(identified.read(span, name), clock) for name in names}
     states = states_about(frames, sensor, span, settings.state_gap_s)
-    at_frames = interpolate_sensor_states(tables["solutions"], states, settings)
+    at_frames = _with_error_of_clock(
+        interpolate_sensor_states(tables["solutions"], states, settings), clock
+    )
     tables["solutions"] = with_sensor_states(tables["solutions"], at_frames)
     tables |= with_prior_attitudes(tables["solutions"], tables["detections"], at_frames)
     tables["rejects"] = rejects_at_true_times(identified.read(span, "rejects"), at_frames)
     write_part(parts.of(span), IDENTIFIED, tables)
+
+
+def _with_error_of_clock(at_frames: pa.Table, clock: SensorVerdict) -> pa.Table:
+    """Return SENSOR_STATES_AT_FRAMES with what the clock may still be off in the positions."""
+    used_km = array(at_frames, "used_position_sigma_km")
+    columns = {name: at_frames[name] for name in at_frames.column_names}
+    columns["used_position_sigma_km"] = np.hypot(used_km, SPEED_KM_S * clock.sigma_s)
+    return table(at_frames.schema, columns)
 
 
 def at_true_times(rows: pa.Table, clock: SensorVerdict) -> pa.Table:

@@ -1,4 +1,4 @@
-"""Judge doubt: what to say of sensors that disagree where none of them can be named."""
+"""Judge doubt: what to say of sensors that disagree, be it clear or not who is wrong."""
 
 from collections.abc import Iterable, Mapping
 
@@ -6,17 +6,20 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 
+from epipole.io.work.work_layout import AddedErrors
 from epipole.schemas.bridge import concat
 from epipole.schemas.tables import CHECKS
+from epipole.tasks.algorithms.constants import ARCSEC
 from epipole.tasks.algorithms.log_checks.findings import (
     FRAME_TIMES,
+    SENSOR_FAULT,
     SENSORS_AGREE,
     UNKNOWN,
     WRONG,
     Finding,
 )
 from epipole.tasks.algorithms.sensor_faults.fault_judgement import Doubt
-from epipole.tasks.check.check_sensors import SensorVerdict
+from epipole.tasks.check.check_sensors import SPEED_KM_S, SensorVerdict
 from epipole.tasks.read.judge_sensor import checks_table
 
 SIGMAS = 4.0  # within which an offset is that of half the exposure
@@ -51,6 +54,29 @@ def doubt_table(doubt: Doubt, more_km: float, exposure_s: Mapping[str, float]) -
         cause = "exposure_start" if doubt.shared_s < 0 else "exposure_end"
         found = found._replace(cause=cause if is_half else "shared_offset", facts=facts)
     return checks_table({name: [found] for name in exposure_s})
+
+
+def fault_table(verdicts: Iterable[SensorVerdict], added: AddedErrors) -> pa.Table:
+    """Return CHECKS of the sensors at fault that take part, corrected or with larger errors."""
+    with_errors = {fault.sensor_id for fault in added.faults}
+    found = {}
+    for one in verdicts:
+        if not (one.sensor_id in with_errors or (one.corrected and one.is_faulty)):
+            continue
+        fault = added.of(one.sensor_id)
+        size, sigma = one.size, one.size_sigma
+        value, unit, cause = fault.left_km, "km", "ephemeris_off"
+        if one.has_wrong_clock:
+            size, sigma, cause = one.offset_s, one.sigma_s, "clock_off"
+            value = SPEED_KM_S * sigma if one.corrected else value
+        elif fault.rad:
+            size, sigma, value = size / ARCSEC, sigma / ARCSEC, fault.left_rad / ARCSEC
+            unit, cause = "arcsec", "attitude_off"
+        facts = {"size": size, "size_sigma": sigma}
+        found[one.sensor_id] = [
+            Finding(SENSOR_FAULT, WRONG, value, expected=0.0, unit=unit, cause=cause, facts=facts)
+        ]
+    return checks_table(found)
 
 
 def name_cut_times(

@@ -14,10 +14,12 @@ import polars as pl
 import pyarrow as pa
 
 from epipole.io.work.parts import read_part
+from epipole.io.work.work_layout import NOTHING_ADDED, AddedErrors
 from epipole.schemas.bridge import concat, from_polars, to_polars
 from epipole.schemas.observation import FITTED_FIELDS
 from epipole.schemas.tables import OBSERVATIONS
 from epipole.schemas.work_tables import SIGHTINGS
+from epipole.tasks.algorithms.constants import ARCSEC
 from epipole.tasks.common.sightings import MARK
 from epipole.tasks.publish.hot_tracklets import hot_tracklets
 from epipole.tasks.publish.night_parts import NightParts, in_slices
@@ -41,9 +43,7 @@ def observations(parts: NightParts) -> Iterator[pa.Table]:
             seen = with_objects(to_polars(concat(SIGHTINGS, rows)), runs)
             seen = seen.filter(pl.col("tracklet_id").is_in(hot.implode()).not_())
             seen = with_links(published(seen), parts)
-            seen = with_shared_errors(seen, errors, parts.solved.more_km).with_columns(
-                **_NOT_FITTED
-            )
+            seen = with_shared_errors(seen, errors, parts.solved.added).with_columns(**_NOT_FITTED)
             yield from_polars(OBSERVATIONS, seen)
 
 
@@ -189,19 +189,30 @@ def _asof(
     )  # fmt: skip
 
 
-def with_shared_errors(rows: pl.DataFrame, errors: pl.DataFrame, more_km: float) -> pl.DataFrame:
-    """Return the rows; shared errors that are larger than stated are as large as they are.
-
-    `more_km` is added to the errors of all positions of sensors, 1-sigma per axis.
-    """
+def with_shared_errors(
+    rows: pl.DataFrame, errors: pl.DataFrame, added: AddedErrors
+) -> pl.DataFrame:
+    """Return the rows; shared errors that are larger than stated are as large as they are."""
+    if added != NOTHING_ADDED:
+        rows = _with_added_errors(rows, added)
     factors = rows.select("sensor_id").join(
         errors, on="sensor_id", how="left", maintain_order="left"
     )
     return rows.with_columns(
         pl.col("bias_sigma_arcsec") * factors["direction"].fill_null(1.0).sqrt(),
-        (
-            (pl.col("position_sigma_km") ** 2 + more_km**2) * factors["position"].fill_null(1.0)
-        ).sqrt()
-        if more_km
-        else pl.col("position_sigma_km") * factors["position"].fill_null(1.0).sqrt(),
+        pl.col("position_sigma_km") * factors["position"].fill_null(1.0).sqrt(),
+    )
+
+
+def _with_added_errors(rows: pl.DataFrame, added: AddedErrors) -> pl.DataFrame:
+    sensors = rows.select(pl.col("sensor_id").unique())
+    faults = [added.of(name) for name in sensors["sensor_id"]]
+    more = sensors.with_columns(
+        km=pl.Series([fault.km for fault in faults], dtype=pl.Float64),
+        arcsec=pl.Series([fault.rad / ARCSEC for fault in faults], dtype=pl.Float64),
+    )
+    of_rows = rows.select("sensor_id").join(more, on="sensor_id", maintain_order="left")
+    return rows.with_columns(
+        position_sigma_km=(pl.col("position_sigma_km") ** 2 + of_rows["km"] ** 2).sqrt(),
+        bias_sigma_arcsec=(pl.col("bias_sigma_arcsec") ** 2 + of_rows["arcsec"] ** 2).sqrt(),
     )

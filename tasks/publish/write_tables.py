@@ -103,7 +103,7 @@ def _attributables(parts: NightParts, span: Span, sensors: pl.DataFrame) -> pl.D
     rows = to_polars(concat(ATTRIBUTABLES, [each.read(span, "attributables") for each in viewed]))
     rows = rows.join(sensors, on="tracklet_id", how="left", maintain_order="left")
     errors = to_polars(parts.solved.shared_errors(span))
-    return with_shared_errors(rows, errors, parts.solved.more_km).drop("sensor_id")
+    return with_shared_errors(rows, errors, parts.solved.added).drop("sensor_id")
 
 
 def _of_sensors(name: str, parts: NightParts) -> Iterator[pa.Table]:

@@ -16,7 +16,7 @@ import pyarrow.compute as pc
 
 from epipole.io.work.kept_parts import part_key
 from epipole.io.work.parts import ASSOCIATED, Parts, write_part
-from epipole.io.work.work_layout import ViewedParts
+from epipole.io.work.work_layout import NOTHING_ADDED, AddedErrors, ViewedParts
 from epipole.schemas.bridge import array, concat, empty, from_polars, table, to_polars
 from epipole.schemas.rejects import Outcome, Reason, reject_rows
 from epipole.schemas.settings import AssociationSettings
@@ -29,7 +29,7 @@ from epipole.tasks.common.sightings import published_ids
 from epipole.tasks.common.stage_tasks import stage_task
 from epipole.tasks.solve.associate_objects import Associated, associate_objects
 from epipole.tasks.solve.association_input import BlockViews, SensorViews
-from epipole.tasks.solve.view_groups import with_position_error
+from epipole.tasks.solve.view_groups import with_added_errors
 
 _RANK = {outcome.value: rank for rank, outcome in enumerate(Outcome)}
 
@@ -81,7 +81,7 @@ def associate_blocks(
     half_width_s: float,
     max_views: int,
     parts: Parts,
-    more_km: float = 0.0,
+    added: AddedErrors = NOTHING_ADDED,
 ) -> None:
     """Find the objects of some blocks of one span, unless the parts exist.
 
@@ -99,20 +99,19 @@ def associate_blocks(
         Limit of the views that a task has in memory at the same time.
     parts
         Where the parts go: `ASSOCIATED` of each block.
-    more_km
-        Error that is added to the positions of all sensors, 1-sigma per axis.
+    added
+        Errors that sensors have beside the stated ones.
     """
     missing = [block for block in blocks if not parts.holds(block)]
     span = blocks[0].span
     seeing = [sensor for sensor in sensors if viewed[sensor.number].holds(span)]
     read = [viewed[sensor.number].of(span) for sensor in seeing] if missing else []
-    of_span = part_key([seeing, left_out, more_km], parts=read)
+    of_span = part_key([seeing, left_out, added], parts=read)
     for block in missing:
         key = None if of_span is None else part_key([Stage.SOLVE, block, of_span])
         if not parts.take(block, key):
             views = [
-                sensor_views(sensor, viewed[sensor.number], block.span, more_km)
-                for sensor in seeing
+                sensor_views(sensor, viewed[sensor.number], block.span, added) for sensor in seeing
             ]
             taking_part = [
                 sensor
@@ -135,12 +134,17 @@ def blocks_of(span: Span, settings: AssociationSettings) -> list[Span]:
     return [span] if settings.window_s * 1e9 > BLOCK_NS else span.blocks
 
 
-def sensor_views(sensor: Sensor, viewed: Parts, span: Span, more_km: float = 0.0) -> SensorViews:
+def sensor_views(
+    sensor: Sensor,
+    viewed: Parts,
+    span: Span,
+    added: AddedErrors = NOTHING_ADDED,
+) -> SensorViews:
     """Return the views of a sensor in a span, mapped into memory."""
     return SensorViews(
         sensor.number,
         sensor.sensor_id,
-        lambda: with_position_error(viewed.read(span, "views"), more_km),
+        lambda: with_added_errors(viewed.read(span, "views"), added),
         viewed.read(span, "epochs"),
         viewed.read(span, "tracklets"),
     )

@@ -15,7 +15,7 @@ import pyarrow.compute as pc
 
 from epipole.io.work.kept_parts import part_key, take_part
 from epipole.io.work.parts import JUDGED, SOLVED, is_written, read_part, write_part
-from epipole.io.work.work_layout import SolvedParts, ViewedParts
+from epipole.io.work.work_layout import NOTHING_ADDED, AddedErrors, SolvedParts, ViewedParts
 from epipole.schemas.arrays import Indices
 from epipole.schemas.bridge import array, concat, to_polars
 from epipole.schemas.settings import PositionSettings, StateSettings
@@ -39,14 +39,18 @@ from epipole.tasks.solve.view_groups import (
     ObjectViews,
     ViewGroups,
     unpack_views,
+    with_added_errors,
     with_larger_errors,
-    with_position_error,
     with_stated_errors,
 )
 
 
 def gather_views(
-    viewed: ViewedParts, members: pa.Table, time: Span, every_ns: int = 1, more_km: float = 0.0
+    viewed: ViewedParts,
+    members: pa.Table,
+    time: Span,
+    every_ns: int = 1,
+    added: AddedErrors = NOTHING_ADDED,
 ) -> tuple[pa.Table, Indices]:
     """Return the VIEWS of objects within a time, and the number of the object of each.
 
@@ -58,8 +62,8 @@ def gather_views(
         OBJECT_MEMBERS of the objects.
     every_ns
         Only epochs that are multiples of this time since midnight.
-    more_km
-        Error that is added to the positions of all sensors, 1-sigma per axis.
+    added
+        Errors that sensors have beside the stated ones.
 
     Notes
     -----
@@ -77,7 +81,7 @@ def gather_views(
             rows, number = _rows(views, parts.read(span, "tracklets"), members_of_sensor)
             kept = array(views, "epoch")[rows] % DAY_NS % every_ns == 0
             rows, number = rows[kept], number[kept]
-            tables.append(with_position_error(views.take(rows), more_km))
+            tables.append(with_added_errors(views.take(rows), added))
             numbers.append(number)
             sensors.append(np.full(len(number), sensor))
     views = concat(VIEWS, tables)
@@ -189,14 +193,14 @@ def solve_piece(
     members = members.filter(pa.compute.field("piece") == piece.number)
     time = piece.span.widened(margin_ns)
     errors = solved.errors.read(piece.span, "errors")
-    made_from = ["positions", piece, margin_ns, sampling, solved.more_km]
+    made_from = ["positions", piece, margin_ns, sampling, solved.added]
     key = _key(viewed, time, made_from, [members, errors])
     if not take_part(part, solved.kept, key):
-        views = unpack_views(*gather_views(viewed, members, time, more_km=solved.more_km))
+        views = unpack_views(*gather_views(viewed, members, time, added=solved.added))
         groups = solve_positions(
             with_larger_errors(views, errors), positions.reject_sigma, piece.span
         )
-        stated = with_stated_errors(groups.views, errors, solved.more_km)
+        stated = with_stated_errors(groups.views, errors, solved.added)
         tables = _tables(groups, stated, sampling, positions.all_pairs, states)
         write_part(part, SOLVED, tables, key=key)
     return _n_positions(part)
@@ -273,10 +277,10 @@ def judge_span(
         return
     members = sample_objects(solved.objects.read(span, "members"), max_views)
     time = span.widened(margin_ns)
-    key = _key(viewed, time, ["errors", every_ns, solved.more_km], [members])
+    key = _key(viewed, time, ["errors", every_ns, solved.added], [members])
     if solved.errors.take(span, key):
         return
-    gathered = gather_views(viewed, members, time, every_ns, solved.more_km)
+    gathered = gather_views(viewed, members, time, every_ns, solved.added)
     views = unpack_views(*gathered)
     groups = solve_positions(views, positions.reject_sigma, span)
     # Directions as fitted, not corrected: the motion that the fits neglect is in their noise.

@@ -11,8 +11,9 @@ import numpy.typing as npt
 import pyarrow as pa
 import pyarrow.compute as pc
 
+from epipole.io.work.work_layout import NOTHING_ADDED, AddedErrors
 from epipole.schemas.arrays import Array, Flags, Indices
-from epipole.schemas.bridge import array, stack, stack_covariance
+from epipole.schemas.bridge import array, stack, stack_covariance, unstack
 from epipole.schemas.columns import TANGENT_AXES
 from epipole.tasks.algorithms.constants import SPEED_OF_LIGHT_KM_S
 from epipole.tasks.algorithms.geometry.directions import apparent_positions
@@ -84,13 +85,28 @@ class ObjectViews(NamedTuple):
         )
 
 
-def with_position_error(views: pa.Table, more_km: float) -> pa.Table:
-    """Return VIEWS with an error added to the positions of sensors, 1-sigma per axis [km]."""
-    if not more_km:
+def with_added_errors(views: pa.Table, added: AddedErrors) -> pa.Table:
+    """Return VIEWS of one sensor without the biases that are known, with errors that are larger."""
+    if added == NOTHING_ADDED or not views.num_rows:
         return views
-    at = views.schema.get_field_index("position_sigma_km")
-    sigma_km = pa.array(np.hypot(array(views, "position_sigma_km"), more_km))
-    return views.set_column(at, views.schema.field(at), sigma_km)
+    fault = added.of(views["sensor_id"][0].as_py())
+    columns = {
+        "position_sigma_km": np.hypot(array(views, "position_sigma_km"), fault.left_km),
+        **unstack("{}_km", stack(views, "{}_km") - np.array(fault.bias_km)),
+    }
+    if fault.left_rad:
+        u, w = stack(views, "u{}"), stack(views, "w{}_rad_s")
+        right = u - np.cross(fault.bias_rad, u)
+        columns |= unstack("u{}", right / np.linalg.norm(right, axis=1, keepdims=True))
+        columns |= unstack("w{}_rad_s", w - np.cross(fault.bias_rad, w))
+        names = [f"cov_bias_{axis}{axis}_rad2" for axis in TANGENT_AXES]
+        columns |= {
+            name: array(views, name) + fault.left_rad**2 for name in (*names, "attitude_rad2")
+        }
+    for name, values in columns.items():
+        at = views.schema.get_field_index(name)
+        views = views.set_column(at, views.schema.field(at), pa.array(values))
+    return views
 
 
 def unpack_views(views: pa.Table, object_number: Indices) -> ObjectViews:
@@ -123,14 +139,18 @@ def with_larger_errors(views: ObjectViews, errors: pa.Table) -> ObjectViews:
     return _scaled(views, errors, 1.0)
 
 
-def with_stated_errors(views: ObjectViews, errors: pa.Table, more_km: float = 0.0) -> ObjectViews:
-    """Return views with the errors that the sensors state.
+def with_stated_errors(
+    views: ObjectViews, errors: pa.Table, added: AddedErrors = NOTHING_ADDED
+) -> ObjectViews:
+    """Return views with the errors of positions that the sensors state.
 
-    Undo `with_larger_errors`, and `with_position_error`.
+    Undo `with_larger_errors`, and of `with_added_errors` what it adds to positions.
     """
     stated = _scaled(views, errors, -1.0)
-    left = np.maximum(stated.sigma_km**2 - more_km**2, 0.0)
-    return stated._replace(sigma_km=np.sqrt(left)) if more_km else stated
+    if added == NOTHING_ADDED:
+        return stated
+    km = np.array([added.of(name).left_km for name in views.sensor_ids.tolist()])[views.sensor]
+    return stated._replace(sigma_km=np.sqrt(np.maximum(stated.sigma_km**2 - km**2, 0.0)))
 
 
 def _scaled(views: ObjectViews, errors: pa.Table, power: float) -> ObjectViews:

@@ -48,7 +48,8 @@ def main() -> None:
                     wrong += clock.is_faulty
             found = late_clock.has_wrong_clock
             estimate = f"{late_clock.offset_s:.3f} | {late_clock.sigma_s:.3f} | {found}"
-            print(f"| {offset_s} | {estimate} | {wrong} | {summary.rejects} |", flush=True)
+            left_out = summary.outcomes.get("sensor_left_out", 0)
+            print(f"| {offset_s} | {estimate} | {wrong} | {left_out} |", flush=True)
     print(f"rms over sigma {np.sqrt(np.mean(np.square(scores))):.2f} of {len(scores)}")
 
 

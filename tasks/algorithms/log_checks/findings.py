@@ -24,6 +24,7 @@ CENTROID_SIGMA = "centroid_sigma"
 LEFT_OUT_STATES = "left_out_states"
 LINES_OF_SIGHT = "lines_of_sight"
 SENSORS_AGREE = "sensors_agree"
+SENSOR_FAULT = "sensor_fault"
 UTC_TIMES = "utc_times"
 
 

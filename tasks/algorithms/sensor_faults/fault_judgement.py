@@ -113,6 +113,9 @@ class JudgedSensors(NamedTuple):
         `SOUND` without a fault.
     size, size_sigma : (s,) float
         Size of a wrong ephemeris [km] or attitude [rad], and its 1-sigma error; else 0.
+    bias, bias_sigma : (s, 3), (s,) float
+        A wrong ephemeris [km] or attitude [rad] (a rotation vector, GCRF), reported minus true, and
+        its 1-sigma error per axis across the sensor's lines of sight; else 0.
     doubt
         What is wrong without a name.
     """
@@ -122,6 +125,8 @@ class JudgedSensors(NamedTuple):
     cause: list[str]
     size: Array
     size_sigma: Array
+    bias: Array
+    bias_sigma: Array
     doubt: Doubt = Doubt()
 
     @property
@@ -184,7 +189,7 @@ def judge_sensors(
         if (good == kept).all() and (np.abs(step_s) < 1e-4).all():
             break
         kept = good
-    judged = _judged(model, explained, has_lines)
+    judged = _judged(model, explained, has_lines, _across(lines, n_sensors))
     return judged._replace(doubt=_doubt(model, explained, has_lines))
 
 
@@ -242,15 +247,12 @@ class Model:
         best = int(np.argmax(evidence))
         return float(SPREADS_KM[best]), evidence[best] / 2 - self.evidence(frozenset())
 
-    def size(self, sensor: int, cause: str, faults: Faults) -> tuple[float, float]:
-        """Return the size of a wrong ephemeris [km] or attitude [rad], and its sigma."""
+    def bias(self, sensor: int, cause: str, faults: Faults) -> tuple[Array, Array]:
+        """Return a wrong ephemeris [km] or attitude [rad], (3,), and its covariance (3, 3)."""
         x, cov = self.estimate(faults)
         columns = np.arange(PER_SENSOR)[COLUMNS[cause]] + PER_SENSOR * sensor
         unit = self.prior_sigma.ravel()[columns]
-        off = x[columns] * unit
-        length = float(np.linalg.norm(off))
-        along = off / max(length, 1e-300) * unit
-        return length, float(np.sqrt(along @ cov[np.ix_(columns, columns)] @ along))
+        return x[columns] * unit, cov[np.ix_(columns, columns)] * np.outer(unit, unit)
 
     def _with_prior(self, faults: Faults) -> tuple[Array, Array, float]:
         weight = self._weights(faults)
@@ -396,13 +398,29 @@ def _neighbouring_sets(faults: Faults, kinds: list[list[tuple[int, str]]]) -> li
     return [*_one_more_or_less(faults, kinds), *exchanged]
 
 
-def _judged(model: Model, explained: _Explanation, has_lines: Flags) -> JudgedSensors:
-    """Return each sensor's offset, with its clock and the declared faults free, and its fault."""
+def _across(lines: Lines, n_sensors: int) -> Array:
+    """Return the mean projection on the planes across each sensor's lines of sight: (s, 3, 3)."""
+    mine = lines.sensor >= 0
+    u, sensor = lines.u[mine], lines.sensor[mine]
+    total = np.zeros((n_sensors, 3, 3))
+    np.add.at(total, sensor, np.eye(3) - np.einsum("ni,nj->nij", u, u))
+    count = np.bincount(sensor, minlength=n_sensors)
+    return total / np.maximum(count, 1)[:, None, None]
+
+
+def _judged(
+    model: Model, explained: _Explanation, has_lines: Flags, across: Array
+) -> JudgedSensors:
+    """Return each sensor's offset, with its clock and the declared faults free, and its fault.
+
+    `across` is that of `_across`: a bias along the lines of sight does not show, nor matter.
+    """
     n = len(has_lines)
     faults = explained.faults
     shared = faults & {(ALL, SHARED)}
     offset, sigma = np.full(n, np.nan), np.full(n, np.nan)
     size, size_sigma = np.zeros(n), np.zeros(n)
+    bias, bias_sigma = np.zeros((n, 3)), np.zeros(n)
     cause = [SOUND] * n
     all_clocks = frozenset((s, CLOCK) for s in range(n))
     for s in np.flatnonzero(has_lines).tolist():
@@ -414,10 +432,14 @@ def _judged(model: Model, explained: _Explanation, has_lines: Flags) -> JudgedSe
     for s, kind in faults - shared:
         cause[s] = kind
         if kind != CLOCK:
-            size[s], size_sigma[s] = model.size(s, kind, faults)
+            bias[s], cov = model.bias(s, kind, faults)
+            size[s] = np.linalg.norm(bias[s])
+            along = bias[s] / max(size[s], 1e-300)
+            size_sigma[s] = np.sqrt(along @ cov @ along)
+            bias_sigma[s] = np.sqrt(np.trace(across[s] @ cov) / 2)
     for s in explained.disagreeing:
         cause[s] = DISAGREES
-    return JudgedSensors(offset, sigma, cause, size, size_sigma)
+    return JudgedSensors(offset, sigma, cause, size, size_sigma, bias, bias_sigma)
 
 
 def _doubt(model: Model, explained: _Explanation, has_lines: Flags) -> Doubt:

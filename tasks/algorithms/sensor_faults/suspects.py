@@ -120,9 +120,11 @@ class _Equations(NamedTuple):
 
 def _nothing_known(n: int) -> JudgedSensors:
     """Return n sound sensors without offsets."""
+    unknown, nothing = np.full(n, np.nan), np.zeros(n)
     return JudgedSensors(
-        np.full(n, np.nan), np.full(n, np.nan), [SOUND] * n, np.zeros(n), np.zeros(n)
-    )
+        unknown, unknown.copy(), [SOUND] * n, nothing, nothing.copy(), np.zeros((n, 3)),
+        nothing.copy(),
+    )  # fmt: skip
 
 
 def _of_other_sensors(lines: Lines, faulty: Flags) -> Lines:
@@ -219,7 +221,7 @@ def _store_offsets(
 
 def _store_judged(found: JudgedSensors, judged: JudgedSensors, together: Indices) -> list[int]:
     """Store the results of sensors that were judged together; return those at fault."""
-    for name in ("offset_s", "sigma_s", "size", "size_sigma"):
+    for name in ("offset_s", "sigma_s", "size", "size_sigma", "bias", "bias_sigma"):
         getattr(found, name)[together] = getattr(judged, name)
     newly = []
     for s, cause in zip(together.tolist(), judged.cause, strict=True):

@@ -34,8 +34,8 @@ def test_an_offset_is_the_correction_and_what_remains_of_it():
     remaining = [SensorVerdict("a", 0.001, 0.008), SOUND]
     total = add_corrections([LATE, EARLY], remaining)
     assert [clock.sensor_id for clock in total] == ["a", "b", "c"]
-    assert total[0] == SensorVerdict("a", 0.251, 0.008, "clock")
-    assert total[1:] == [EARLY, SOUND]
+    assert total[0] == SensorVerdict("a", 0.251, 0.008, "clock", corrected=True)
+    assert total[1:] == [EARLY._replace(corrected=True), SOUND]
 
 
 def test_without_views_no_clock_is_known():

@@ -1,4 +1,4 @@
-"""A night with a wrong clock, end to end: corrected, or named and its sensor left out."""
+"""A night with a sensor at fault: it is corrected, or its errors are as large as its fault."""
 
 import tomllib
 from pathlib import Path
@@ -6,6 +6,7 @@ from pathlib import Path
 import polars as pl
 import pytest
 
+from epipole.flows.evaluate import evaluate
 from epipole.schemas.scene import validate_scene
 
 pytestmark = pytest.mark.long
@@ -13,14 +14,15 @@ pytestmark = pytest.mark.long
 FOUR_SENSORS = Path(__file__).parents[3] / "io/simulation/built_in/four_sensor_geo.toml"
 
 
-def run(folder, offset_s, **alignment):
-    """Four sensors and nine objects, the third sensor's clock off."""
+def run(folder, offset_s, offset_km=0.0, **alignment):
+    """Four sensors and nine objects; the third sensor's clock is off, or its ephemeris."""
     from epipole.flows.nightly import nightly
     from epipole.flows.simulate import simulate
 
     log = folder / "late.mcap"
     scene = tomllib.loads(FOUR_SENSORS.read_text()) | {"duration_s": 40.0, "seed": 3}
     scene["sensors"][2]["clock_offset_s"] = offset_s
+    scene["sensors"][2]["faults"] = {"position_offset_km": offset_km}
     simulate(validate_scene(scene, "late"), log)
     out = folder / f"out{len(alignment)}"
     return nightly([str(log)], str(out), {"alignment": alignment}), out
@@ -32,7 +34,7 @@ def scan(out, name):
 
 @pytest.mark.parametrize("offset_s", [-2.0, 0.2])
 def test_a_sensor_whose_clock_was_corrected_takes_part(prefect, tmp_path, offset_s):
-    summary, out = run(tmp_path, offset_s, correct_clocks=True)
+    summary, out = run(tmp_path, offset_s)
     assert len(summary.faults) == 1
     side = "late" if offset_s > 0 else "early"
     assert summary.faults[0].startswith("the clock of sat3 is")
@@ -47,9 +49,40 @@ def test_a_sensor_whose_clock_was_corrected_takes_part(prefect, tmp_path, offset
     assert "clock_off" not in summary.rejects
 
 
-def test_a_sensor_whose_clock_stays_wrong_is_named_and_left_out(prefect, tmp_path):
-    summary, out = run(tmp_path, 0.2)
-    assert summary.faults[0].startswith("the clock of sat3 is 0.")
-    assert summary.rejects["clock_off"] > 0
+@pytest.mark.parametrize(
+    ("offset_s", "offset_km", "fault", "added_km", "sigma_km"),
+    [
+        (0.2, 0.0, "the clock of sat3 is 0.", 1.5, 1.5),
+        (0.0, 2.0, "the ephemeris of sat3 is ", 1.4, 0.05),  # its tracklets are undecided at first
+        (0.0, 6.0, "the ephemeris of sat3 is ", 4.2, 0.05),  # its tracklets join none at first
+    ],
+)
+def test_a_sensor_at_fault_takes_part_with_an_error_as_large(
+    prefect, tmp_path, offset_s, offset_km, fault, added_km, sigma_km
+):
+    summary, out = run(tmp_path, offset_s, offset_km, correct_clocks=False)
+    assert summary.faults[0].startswith(fault)
+    (mistake,) = summary.mistakes
+    assert mistake.startswith("sat3: lines of sight meet those of other sensors if its ")
+    assert (summary.outcomes, summary.verdicts) == ({"object": 36}, {"sound": 9})
+    assert summary.rejects == {}
+    (row,) = scan(out, "checks").filter(check="sensor_fault").to_dicts()
+    assert (row["sensor_id"], row["unit"]) == ("sat3", "km")
+    assert sigma_km < row["value"] < 4 * sigma_km
+    seen = scan(out, "observations")
+    stated = dict(seen.group_by("sensor_id").agg(pl.col("position_sigma_km").min()).iter_rows())
+    assert added_km < stated["sat3"] < 1.6 * added_km
+    assert stated["sat1"] < 0.1
+    report = evaluate(out, tmp_path / "late.mcap")
+    assert 0.6 < report.nees_mean < 1.4
+    assert report.nees_in_99 > 0.97
+
+
+def test_a_sensor_that_is_far_too_wrong_is_left_out(prefect, tmp_path):
+    summary, out = run(tmp_path, 0.0, 20.0)
+    assert summary.faults[0].startswith("the ephemeris of sat3 is ")
+    assert summary.mistakes == []
+    assert summary.rejects["ephemeris_off"] > 0
+    assert summary.outcomes == {"object": 27, "sensor_left_out": 9}
     assert "sat3" not in set(scan(out, "associations")["sensor_id"])
     assert scan(out, "positions")["object_id"].n_unique() == 9

@@ -4,8 +4,10 @@ import polars as pl
 import pytest
 from scenes.associations import filled
 
+from epipole.io.work.work_layout import NOTHING_ADDED, AddedErrors, SensorFault
 from epipole.schemas.bridge import to_polars
 from epipole.schemas.work_tables import SIGHTINGS
+from epipole.tasks.algorithms.constants import ARCSEC
 from epipole.tasks.publish.observed_objects import (
     longest_object,
     published,
@@ -107,6 +109,11 @@ def test_shared_errors_are_as_large_as_the_objects_show():
         sensor_id=pl.Series(["a", "b"]), bias_sigma_arcsec=2.0, position_sigma_km=0.1
     )
     errors = pl.DataFrame({"sensor_id": ["b"], "direction": [9.0], "position": [4.0]})
-    found = with_shared_errors(seen, errors, 0.0)
+    found = with_shared_errors(seen, errors, NOTHING_ADDED)
     assert found["bias_sigma_arcsec"].to_list() == [2.0, 6.0]
     assert found["position_sigma_km"].to_list() == [0.1, 0.2]
+    added = AddedErrors(1.0, (SensorFault("a", km=2.0, rad=1.5 * ARCSEC),))
+    found = with_shared_errors(seen, errors, added)
+    assert found["bias_sigma_arcsec"].to_list() == pytest.approx([2.5, 6.0])
+    assert found["position_sigma_km"].to_list() == pytest.approx([5.01**0.5, 2 * 1.01**0.5])
+    assert with_shared_errors(seen.clear(), errors, added).is_empty()

@@ -82,7 +82,7 @@ def test_all_checks_and_causes_are_declared_and_have_a_sentence(sound):
                            "lead_s", "trail_s", "cx_px", "cy_px", "width", "height", "x_px",
                            "y_px", "low", "high", "offset_s", "share_percent", "odds", "lost_s",
                            "length_s", "known", "tracklets", "as_written", "within_s",
-                           "sigma_s", "exposure_s", "frames", "interval_s"),
+                           "sigma_s", "exposure_s", "frames", "interval_s", "size", "size_sigma"),
                           3.0)  # fmt: skip
     rows = [Finding(LogCheck.VELOCITY, cause.verdict, 1.0, 2.0, 3.0, "", cause.value, facts)
             for cause in LogCause]  # fmt: skip
