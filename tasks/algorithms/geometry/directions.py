@@ -125,8 +125,14 @@ def unit_from_radec(ra: Array, dec: Array) -> Array:
 
 def radec_from_unit(u: Array) -> tuple[Array, Array]:
     """Return right ascension in [0, 2 pi) and declination [rad] of (..., 3) vectors."""
-    ra = np.arctan2(u[..., 1], u[..., 0]) % (2 * np.pi)
+    ra = _in_one_turn(np.arctan2(u[..., 1], u[..., 0]))
     return ra, np.arctan2(u[..., 2], np.hypot(u[..., 0], u[..., 1]))
+
+
+def _in_one_turn(angle: Array) -> Array:
+    """Return angles in [0, 2 pi) [rad]. The remainder of a tiny negative one is rounded to 2 pi."""
+    turned = angle % (2 * np.pi)
+    return np.where(turned < 2 * np.pi, turned, turned - 2 * np.pi)
 
 
 def aberrate(u: Array, v_km_s: Array) -> Array:
@@ -204,8 +210,7 @@ def boresight_angles(R_sensor_from_icrs: Array) -> tuple[Array, Array, Array]:
     up, boresight = -R_sensor_from_icrs[..., 1, :], R_sensor_from_icrs[..., 2, :]
     ra, dec = radec_from_unit(boresight)
     to_east, to_north = np.einsum("...ij,...j->i...", east_north(boresight), up)
-    roll = np.arctan2(to_east, to_north)
-    return ra, dec, roll % (2 * np.pi)
+    return ra, dec, _in_one_turn(np.arctan2(to_east, to_north))
 
 
 def lengths(v: Array) -> Array:

@@ -58,6 +58,17 @@ def test_angles_and_unit_vectors_are_each_others_inverse(seed):
     np.testing.assert_allclose(unit_from_radec(ra, dec), u, atol=1e-15)
 
 
+@pytest.mark.parametrize("y", [-1e-17, -0.0, 0.0, -1e-15])
+def test_right_ascension_and_roll_stay_below_a_full_turn(y):
+    u = np.array([1.0, y, 0.0])
+    ra, _ = radec_from_unit(u)
+    assert 0.0 <= ra < 2 * np.pi
+    # East is y at this boresight, and the image's upper side is nearly north.
+    R = np.array([[0.0, 1.0, -y], [0.0, -y, -1.0], u])
+    for angle in (boresight_angles(R)[0], boresight_angles(R)[2]):
+        assert 0.0 <= angle < 2 * np.pi
+
+
 @settings(deadline=None)
 @given(seeds)
 def test_the_tangent_basis_is_a_right_handed_triad(seed):
