@@ -189,9 +189,10 @@ def _images(stars: pa.Table, camera: Camera) -> StarImages:
     number = np.cumsum(np.diff(frame, prepend=frame[:1]) != 0) if len(frame) else frame
     step = max(1, -(-len(frame) // MAX_STARS))
     kept = np.isfinite(dx) & np.isfinite(dy) & (number % step == 0)
-    x, y, dx, dy = x[kept], y[kept], dx[kept], dy[kept]
+    # A star at the fold of the distortion may be predicted beyond it, where no direction is.
     u_sensor = unproject(camera, x - dx, y - dy)
-    return StarImages(x, y, u_sensor, number[kept], array(stars, "star_id")[kept])
+    kept &= np.isfinite(u_sensor[:, 2])
+    return StarImages(x[kept], y[kept], u_sensor[kept], number[kept], array(stars, "star_id")[kept])
 
 
 def _fit(

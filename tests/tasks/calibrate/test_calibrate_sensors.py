@@ -122,3 +122,20 @@ def test_a_sensor_with_two_calibrations_is_unchanged():
     found = calibrate_sensors(stars_of("a", TRUE), both, both)
     assert found.calibrations.num_rows == 0
     assert found.cameras.equals(both)
+
+
+def test_a_star_that_is_predicted_beyond_the_fold_of_the_distortion_takes_no_part():
+    # Folds at 673 px from the middle, before the corners; there x - dx has no direction.
+    lens = Camera(1024, 1024, 900.0, 900.0, 511.5, 511.5, k1=-0.265)
+    stars = stars_of("a", lens, used=lens)
+    at_fold = array(stars, "x_px").copy()
+    at_fold[7], dx = 1020.0, array(stars, "dx_px").copy()
+    y, dy = array(stars, "y_px").copy(), array(stars, "dy_px").copy()
+    y[7], dx[7], dy[7] = 951.5, -0.5, -0.5
+    columns = {name: stars[name] for name in STARS.names}
+    changed = table(STARS, columns | {"x_px": at_fold, "y_px": y, "dx_px": dx, "dy_px": dy})
+    told = cameras_of({"a": lens})
+    found = calibrate_sensors(changed, told, told)
+    assert found.departed == []
+    assert array(found.calibrations, "n_stars").tolist() == [stars.num_rows - 1]
+    assert array(found.calibrations, "k1")[0] == pytest.approx(lens.k1, abs=0.02)
