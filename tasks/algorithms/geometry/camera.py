@@ -258,6 +258,19 @@ def _straighten(camera: Camera, xd: Array, yd: Array) -> tuple[Array, Array]:
     return np.where(found, x, np.nan), np.where(found, y, np.nan)
 
 
+def ends_of_fold(camera: Camera, n: int) -> tuple[Array, Array]:
+    """Return directions (x, y, 1) at the fold of the distortion that lie in the image: of n around
+    the boresight."""
+    turn = np.linspace(0.0, 2 * np.pi, n, endpoint=False)
+    r = (1 - 1e-9) * fold_radius(camera)  # rounding must not put them beyond
+    if not np.isfinite(r):
+        return np.empty(0), np.empty(0)
+    x, y = r * np.cos(turn), r * np.sin(turn)
+    xd, yd = _bend(camera, x, y)
+    at = inside(camera, camera.cx_px + camera.fx_px * xd, camera.cy_px + camera.fy_px * yd)
+    return _direction(camera, x[at], y[at])
+
+
 def _before(fold: float, x: Array, y: Array) -> tuple[Array, Array]:
     """Return points (n,), those from the fold on moved to just before it."""
     shrunk = 0.999 * fold / np.maximum(np.hypot(x, y), 0.999 * fold)

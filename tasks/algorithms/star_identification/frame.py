@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from epipole.schemas.arrays import Array, Indices, Integers
-from epipole.tasks.algorithms.geometry.camera import Camera, undistort
+from epipole.tasks.algorithms.geometry.camera import Camera, ends_of_fold, undistort
 from epipole.tasks.algorithms.kernels import kernel
 from epipole.tasks.algorithms.star_identification.evidence import (
     TYPICAL_SCATTER_MAG,
@@ -491,7 +491,9 @@ def without_clusters(u: Array, box: Array) -> Indices:
 
 # The field of view of a camera.
 
-EDGE_POINTS = 9  # of each edge of the image, at which the distortion is taken
+# Points of each edge of the image, at which the distortion is taken, and of the circle at which it
+# folds.
+EDGE_POINTS, FOLD_POINTS = 9, 360
 
 
 def field_of_view(camera: Camera) -> FieldOfView:
@@ -504,7 +506,9 @@ def field_of_view(camera: Camera) -> FieldOfView:
     x, y = undistort(
         camera, (x_px - camera.cx_px) / camera.fx_px, (y_px - camera.cy_px) / camera.fy_px
     )
-    # Corners that a wide lens does not reach have no direction.
+    # Corners that a wide lens does not reach have no direction: its field ends at the fold.
+    if np.isnan(x).any():
+        x, y = map(np.concatenate, zip((x, y), ends_of_fold(camera, FOLD_POINTS), strict=True))
     half_diagonal = float(np.arctan(np.nanmax(np.hypot(x, y))))
     box = np.array([np.nanmin(x), np.nanmax(x), np.nanmin(y), np.nanmax(y)])
     return FieldOfView(half_diagonal, box, camera.pixel_rad)

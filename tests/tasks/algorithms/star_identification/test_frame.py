@@ -14,11 +14,13 @@ from scenes.random_stars import (
 )
 
 from epipole.tasks.algorithms.constants import SPEED_OF_LIGHT_KM_S
+from epipole.tasks.algorithms.geometry.camera import Camera, unproject
 from epipole.tasks.algorithms.geometry.directions import aberrate
 from epipole.tasks.algorithms.star_identification.frame import (
     N_PATTERN,
     N_SEARCHED,
     aberrate_all,
+    field_of_view,
     identify_predicted,
     search_frame,
     search_lost,
@@ -43,6 +45,24 @@ def test_aberration_is_the_one_of_sky():
 def test_the_solid_angle_is_that_of_the_image():
     side = 2 * np.arctan(512 / 3660)
     assert optics(CAMERA).solid_angle_sr == pytest.approx(side**2, rel=0.03)
+
+
+@pytest.mark.parametrize("fisheye", [False, True])
+@pytest.mark.parametrize("fold_px", [530.0, 563.0, 640.0, 700.0])
+def test_the_field_of_a_lens_that_folds_before_the_corners_reaches_to_the_fold(fold_px, fisheye):
+    # With k1 alone, the image of the fold is at two thirds of its ideal distance.
+    k1 = -1 / (3 * (1.5 * fold_px / 900.0) ** 2)
+    lens = Camera(1024, 1024, 900.0, 900.0, 511.5, 511.5, k1=k1, fisheye=fisheye)
+    # All around, to the end of the image or just before the fold.
+    turn = np.linspace(0, 2 * np.pi, 3000)
+    to_edge = 511.9 / np.maximum(np.abs(np.cos(turn)), np.abs(np.sin(turn)))
+    r_px = np.minimum(to_edge, fold_px - 0.01)
+    u = unproject(lens, 511.5 + r_px * np.cos(turn), 511.5 + r_px * np.sin(turn))
+    field = field_of_view(lens)
+    widest = np.arccos(u[:, 2].min())
+    assert widest < field.half_diagonal_rad < widest + 0.005
+    x, y = u[:, 0] / u[:, 2], u[:, 1] / u[:, 2]
+    np.testing.assert_allclose(field.box, [x.min(), x.max(), y.min(), y.max()], atol=0.02)
 
 
 def test_only_the_brightest_centroids_are_searched():
