@@ -124,7 +124,12 @@ def _close_pairs(u: Array, merge_rad: float) -> list[tuple[int, int]]:
 
 
 def limit_for_density(magnitude: Array, stars_per_sr: float) -> float:
-    """Return the magnitude limit at which a catalogue, brightest first, has this mean density."""
+    """Return the magnitude limit at which a catalogue, brightest first, has this mean density.
+
+    0 for a catalogue without stars.
+    """
+    if not len(magnitude):
+        return 0.0
     n = int(np.clip(round(stars_per_sr * 4 * np.pi), 1, len(magnitude)))
     return float(magnitude[n - 1])
 

@@ -2,6 +2,7 @@
 
 import hashlib
 import inspect
+import logging
 import sys
 from functools import cache, lru_cache
 from types import ModuleType
@@ -17,7 +18,7 @@ from epipole.schemas.bridge import array
 from epipole.schemas.star_lists import STAR_CATALOGUE, label_of
 from epipole.tasks.algorithms import star_catalogue
 from epipole.tasks.algorithms import times as time_scales
-from epipole.tasks.algorithms.constants import DAY_NS
+from epipole.tasks.algorithms.constants import ARCSEC, DAY_NS
 from epipole.tasks.algorithms.star_catalogue import (
     NavigationCatalogue,
     limit_for_density,
@@ -37,6 +38,8 @@ from epipole.tasks.algorithms.star_identification.star_grid import (
 )
 from epipole.tasks.algorithms.star_identification.star_pairs import KVector, NearStars, PairTable
 from epipole.tasks.algorithms.times import earth_barycentric, julian_year
+
+LOGGER = logging.getLogger(__name__)
 
 # Stars whose position at the date is less certain than this are not used [pixels, 1-sigma].
 SURE_PX = 0.5
@@ -110,8 +113,16 @@ def _navigation(
     def make() -> dict[str, npt.NDArray[Any]]:
         return dict(_make_navigation(catalogue, day, pixel_rad, merge_px)._asdict())
 
-    kept = cached(_disk_key("stars", catalogue, day, pixel_rad, merge_px), make)
-    return NavigationCatalogue(**kept)
+    kept = NavigationCatalogue(
+        **cached(_disk_key("stars", catalogue, day, pixel_rad, merge_px), make)
+    )
+    if not len(kept.star_id):
+        LOGGER.warning(
+            "no star of the catalogue is known to half a pixel (%.2g arcsec) at this date: "
+            "no frame can be identified",
+            SURE_PX * pixel_rad / ARCSEC,
+        )
+    return kept
 
 
 def _make_navigation(

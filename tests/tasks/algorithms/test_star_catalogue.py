@@ -92,3 +92,4 @@ def test_the_limit_for_a_density_has_that_density():
 def test_an_empty_catalogue_gives_an_empty_one():
     found = navigation_catalogue(np.empty(0, np.int64), np.empty((0, 3)), np.empty(0), 1e-4)
     assert len(found.star_id) == len(found.u_icrs) == 0
+    assert np.isfinite(limit_for_density(found.magnitude, 100.0))

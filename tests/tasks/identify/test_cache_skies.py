@@ -150,3 +150,9 @@ def test_a_star_with_an_uncertain_place_is_not_used(folder):
     left_out = _skies(day=17_600, pm_sigma_mas_yr=unsure).sky(9.0).catalogue.star_id
     assert len(left_out) > 5000
     assert not np.isin(_table()["star_id"].to_numpy()[:100], left_out).any()
+
+
+def test_where_no_star_is_certain_the_sky_is_empty_and_a_warning_says_so(folder, caplog):
+    skies = _skies(pm_sigma_mas_yr=np.full(6000, 1000.0))
+    assert not len(skies.sky(skies.limit_for(100.0)).catalogue.star_id)
+    assert "no star of the catalogue is known to half a pixel (5.2 arcsec)" in caplog.text
