@@ -198,6 +198,8 @@ def match_stars(u, sigma, v, radius, matches, strict, owner, contested):
                 contested[best] = True
             if chi2_of[other] <= chi2:
                 continue
+            if chi2_of[other] - chi2 >= CLEARLY_BETTER:  # than all before, whoever contested it
+                contested[best] = False
             star_of[other] = -1
         owner[best] = k
         star_of[k] = best

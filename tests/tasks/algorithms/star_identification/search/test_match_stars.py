@@ -1,5 +1,6 @@
 """Identification near a known attitude."""
 
+import itertools
 import time
 
 import numpy as np
@@ -54,6 +55,13 @@ def test_a_star_between_two_centroids_is_neither_unless_one_is_clearly_nearer():
     assert _match([[0.01, 0, 1], [-0.012, 0, 1]], [[0.0, 0, 1]]) == [-1, -1]
     assert _match([[0.001, 0, 1], [-0.05, 0, 1]], [[0.0, 0, 1]]) == [0, -1]
     assert _match([[-0.05, 0, 1], [0.001, 0, 1]], [[0.0, 0, 1]]) == [-1, 0]
+
+
+@pytest.mark.parametrize("order", itertools.permutations(range(3)))
+def test_a_star_is_its_clearly_nearest_centroids_whichever_came_first(order):
+    # 0, 3 and 3.2 sigmas off: the two others contest the star, until the first one comes.
+    off = [[0.0, 0, 1], [0.03, 0, 1], [-0.032, 0, 1]]
+    assert _match([off[k] for k in order], [[0.0, 0, 1]]) == [-1 if k else 0 for k in order]
 
 
 def test_compiled_aberration_is_the_one_of_sky():
