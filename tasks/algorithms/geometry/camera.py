@@ -231,11 +231,16 @@ def undistort(camera: Camera, xd: Array, yd: Array) -> tuple[Array, Array]:
     return _direction(camera, *_straighten(camera, xd, yd))
 
 
+# Of Newton's method: most steps, of which ordinary lenses take four, and the longest one over the
+# distance from the principal point. Where the image hardly grows, a whole step leads far away.
+MAX_STEPS, LONGEST_STEP = 40, 0.2
+
+
 def _straighten(camera: Camera, xd: Array, yd: Array) -> tuple[Array, Array]:
     """Return the inverse of `_bend`, NaN beyond the fold."""
     x, y = np.array(xd, float), np.array(yd, float)
-    fold = fold_radius(camera)
-    for _ in range(8 if np.isinf(fold) else 40):
+    fold, longest = fold_radius(camera), LONGEST_STEP * np.hypot(x, y)
+    for _ in range(MAX_STEPS):
         ex, ey = _bend(camera, x, y)
         ex -= xd
         ey -= yd
@@ -243,16 +248,13 @@ def _straighten(camera: Camera, xd: Array, yd: Array) -> tuple[Array, Array]:
         last = max(np.abs(ex).max(initial=0.0), np.abs(ey).max(initial=0.0)) < 1e-9
         jxx, jxy, jyy = _bend_slopes(camera, x, y)
         determinant = jxx * jyy - jxy * jxy
-        x, y = (
-            x - (jyy * ex - jxy * ey) / determinant,
-            y - (jxx * ey - jxy * ex) / determinant,
-        )
+        dx, dy = (jyy * ex - jxy * ey) / determinant, (jxx * ey - jxy * ex) / determinant
+        part = longest / np.maximum(np.hypot(dx, dy), np.maximum(longest, 1e-300))
+        x, y = x - part * dx, y - part * dy
         if last:
             break
         if np.isfinite(fold):
             x, y = _before(fold, x, y)
-    if np.isinf(fold):
-        return x, y
     ex, ey = _bend(camera, x, y)
     found = (np.hypot(ex - xd, ey - yd) < 1e-7) & (np.hypot(x, y) <= fold)
     return np.where(found, x, np.nan), np.where(found, y, np.nan)

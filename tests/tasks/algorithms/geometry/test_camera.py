@@ -100,6 +100,32 @@ def test_before_the_fold_of_a_wide_lens_undistortion_is_the_inverse_and_beyond_i
     assert np.isfinite(u[:, 2]).tolist() == [False, True, False]
 
 
+@pytest.mark.parametrize(
+    ("f_px", "terms"),
+    [
+        (1547.0, (-0.79, -3.98, 9.46)),
+        (1721.0, (-0.77, -14.1, 46.5)),
+        (1085.0, (-0.365, -1.03, 1.04)),
+    ],
+)
+def test_where_an_image_hardly_grows_towards_its_corners_undistortion_is_the_inverse(f_px, terms):
+    k1, k2, k3 = terms
+    lens = Camera(1024, 1024, f_px, f_px, 511.5, 511.5, k1=k1, k2=k2, k3=k3)
+    assert fold_radius(lens) == np.inf
+    x, y = (axis.ravel() for axis in np.meshgrid(*[np.linspace(0.0, 1023.0, 41)] * 2))
+    got = project(lens, unproject(lens, x, y))
+    np.testing.assert_allclose(got, [x, y], atol=1e-7)
+
+
+def test_where_tangential_terms_fold_the_image_there_is_no_direction():
+    lens = WIDE._replace(k1=0.0, p1=-0.3)
+    x, y = (axis.ravel() for axis in np.meshgrid(*[np.linspace(0.0, 1023.0, 41)] * 2))
+    u = unproject(lens, x, y)
+    known = np.isfinite(u[:, 2])
+    assert 0.5 < known.mean() < 1.0
+    np.testing.assert_allclose(project(lens, u[known]), [x[known], y[known]], atol=1e-4)
+
+
 def test_a_camera_that_does_not_fold_has_no_fold():
     assert fold_radius(WIDE._replace(k1=0.2)) == np.inf
 
