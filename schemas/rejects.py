@@ -280,11 +280,16 @@ class Reason(StrEnum):
         "the frames give no position.",
         Trait.SUMMED,
     )
+    REPEATED_CENTROID = (
+        "repeated_centroid",
+        Stage.IDENTIFY,
+        "Centroids at the very position of another one of their frame; the brightest is used.",
+    )
     OUTSIDE_IMAGE = (
         "outside_image",
         Stage.IDENTIFY,
-        "Centroids outside the image that the calibration states; if they are many, its width or "
-        "height is wrong.",
+        "Centroids outside the image that the calibration states, or in its corners beyond the "
+        "fold of the distortion; if they are many, its width, its height or its D is wrong.",
     )
     TOO_MANY_DETECTIONS = (
         "too_many_detections",

@@ -271,22 +271,20 @@ def skies_at(time_ns: int, rule: IdentificationSettings) -> Callable[[float], Sk
 def image_frames(
     exposures: pa.Table, frame_states: pa.Table, sensors: SensorSettings
 ) -> list[ImageFrame]:
-    """Return the centroids of each frame, brightest first.
+    """Return the centroids of each frame, brightest first, each position once.
 
     `frame_states` are SENSOR_STATES_AT_FRAMES of `exposures`.
     """
     x_px, first = flatten(exposures, "x_px")
     c = flatten_centroids(exposures, CAMERAS.empty_table(), sensors)
     at = brightest_first(first, c.flux)
-    magnitude = -2.5 * np.log10(c.flux[at])
     beta = barycentric_velocity(array(exposures, "time"), frame_states) / SPEED_OF_LIGHT_KM_S
-    x, y, sigma_px = x_px[at], c.y_px[at], c.sigma_px[at]
     frames = []
     for k in range(exposures.num_rows):
-        of_frame = slice(first[k], first[k + 1])
-        frames.append(
-            ImageFrame(x[of_frame], y[of_frame], sigma_px[of_frame], magnitude[of_frame], beta[k])
-        )
+        rows = at[first[k] : first[k + 1]]
+        rows = rows[~c.repeated[rows]]
+        magnitude = -2.5 * np.log10(c.flux[rows])
+        frames.append(ImageFrame(x_px[rows], c.y_px[rows], c.sigma_px[rows], magnitude, beta[k]))
     return frames
 
 

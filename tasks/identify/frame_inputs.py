@@ -33,6 +33,8 @@ from epipole.tasks.algorithms.star_identification.centroids import filled_sigmas
 
 LOGGER = logging.getLogger(__name__)
 
+_MIX = np.uint64(0x9E3779B97F4A7C15)  # an odd number with mixed bits, from the golden ratio
+
 
 class FlatCentroids(NamedTuple):
     """All centroids of one sensor's frames, one after another.
@@ -54,6 +56,7 @@ class FlatCentroids(NamedTuple):
     cameras: dict[int, Camera]
     row_s: Array  # time of a centroid's row after the frame's
     turn: Array  # (N, 3) rotation of directions from the frame's time to the row's [rad]
+    repeated: Flags  # at the very position of another one of the frame; then not `in_image` either
 
 
 def flatten_centroids(
@@ -72,18 +75,36 @@ def flatten_centroids(
     u, pixel_rad = np.zeros((len(x_px), 3)), np.ones(len(x_px))
     row_s, turn = np.zeros(len(x_px)), np.zeros((len(x_px), 3))
     in_image = np.zeros(len(x_px), np.bool_)
+    flux = optional_values(exposures, "flux")
+    repeated = repeats(frame, x_px, y_px, flux)
     for row, camera in used.items():
         at = camera_of_frame[frame] == row
         u[at] = unproject(camera, x_px[at], y_px[at])
         pixel_rad[at] = pixel_angle(camera, u[at])
         row_s[at] = row_offset_s(camera, y_px[at])
         # In the corners of a wide lens's image, a position may have no direction.
-        in_image[at] = inside(camera, x_px[at], y_px[at]) & np.isfinite(u[at, 2])
-    flux = optional_values(exposures, "flux")
+        in_image[at] = inside(camera, x_px[at], y_px[at]) & np.isfinite(u[at, 2]) & ~repeated[at]
     return FlatCentroids(
         first, frame, x_px, y_px, flux, sigma_px, u, pixel_rad, in_image, camera_of_frame, used,
-        row_s, turn,
+        row_s, turn, repeated,
     )  # fmt: skip
+
+
+def repeats(frame: Integers, x_px: Array, y_px: Array, flux: Array) -> Flags:
+    """Return which centroids (n,) have the very position of a brighter or an earlier one of their
+    frame. A star that two centroids fit equally well would be left without any."""
+    found = np.zeros(len(x_px), np.bool_)
+    # Equal positions have equal numbers: without two of these, which is usual, nothing is sorted
+    # by position, which takes ten times as long.
+    x, y = (np.ascontiguousarray(v, np.float64).view(np.uint64) for v in (x_px, y_px))
+    number = np.sort((x * _MIX + y) * _MIX + frame.astype(np.uint64))
+    if not np.any(number[1:] == number[:-1]):
+        return found
+    order = np.lexsort((-np.nan_to_num(flux), y_px, x_px, frame))
+    later, before = order[1:], order[:-1]
+    same = (frame[later] == frame[before]) & (x_px[later] == x_px[before])
+    found[later[same & (y_px[later] == y_px[before])]] = True
+    return found
 
 
 def optional_values(exposures: pa.Table, name: str) -> Array:

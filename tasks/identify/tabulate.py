@@ -258,15 +258,18 @@ def detections_table(
 def rejects_table(exposures: pa.Table, c: FlatCentroids, left_out: Integers) -> pa.Table:
     """Return rows of `rejects`, per log and reason.
 
-    They count centroids in frames without a camera, centroids outside the image, and detections
-    beyond the limit; `left_out` are the latter by frame.
+    They count centroids in frames without a camera, repeated ones, centroids outside the image, and
+    detections beyond the limit; `left_out` are the latter by frame.
     """
-    uncalibrated = np.where(c.camera_of_frame < 0, np.diff(c.first), 0)
-    outside = np.bincount(c.frame[~c.in_image], minlength=exposures.num_rows) - uncalibrated
+    n, calibrated = exposures.num_rows, c.camera_of_frame >= 0
+    uncalibrated = np.where(calibrated, 0, np.diff(c.first))
+    repeated = np.where(calibrated, np.bincount(c.frame[c.repeated], minlength=n), 0)
+    outside = np.bincount(c.frame[~c.in_image], minlength=n) - uncalibrated - repeated
     return concat(
         REJECTS,
         [
             _counted(Reason.NO_CALIBRATION, exposures, uncalibrated),
+            _counted(Reason.REPEATED_CENTROID, exposures, repeated),
             _counted(Reason.OUTSIDE_IMAGE, exposures, outside),
             _counted(Reason.TOO_MANY_DETECTIONS, exposures, left_out),
         ],

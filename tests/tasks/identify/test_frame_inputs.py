@@ -13,7 +13,11 @@ from epipole.schemas.bridge import array, stack, table
 from epipole.schemas.settings import Settings
 from epipole.schemas.work_tables import EXPOSURES
 from epipole.tasks.algorithms.geometry.camera import Camera
-from epipole.tasks.identify.frame_inputs import flatten_centroids, interpolate_sensor_states
+from epipole.tasks.identify.frame_inputs import (
+    flatten_centroids,
+    interpolate_sensor_states,
+    repeats,
+)
 
 START_NS = 1_554_091_200_000_000_000
 SECOND_NS = 1_000_000_000
@@ -46,6 +50,14 @@ def test_places_go_row_by_row_with_the_exposures(tmp_path):
     for name in ("sensor_id", "frame_number", "time"):
         assert places[name].equals(log.exposures[name])
     np.testing.assert_allclose(array(places, "x_km"), [7500.0] * 5 + [7000.0] * 5, atol=1e-9)
+
+
+def test_of_centroids_at_one_position_of_a_frame_the_brightest_counts():
+    frame = np.array([0, 0, 0, 0, 0, 1, 1, 1])
+    x, y = np.array([[5, 5, 5, 7, 5, 5, 8, 8], [6, 6, 7, 6, 6, 6, 1, 1]], float)
+    flux = np.array([2.0, 3.0, 9.0, 9.0, np.nan, 1.0, np.nan, np.nan])
+    assert np.flatnonzero(repeats(frame, x, y, flux)).tolist() == [0, 4, 7]
+    assert not repeats(frame[:0], x[:0], y[:0], flux[:0]).any()
 
 
 def test_a_missing_centroid_sigma_is_the_median_of_the_sensors_others():

@@ -135,6 +135,19 @@ def test_every_frame_is_solved_and_no_star_is_wrong(log, found):
     assert len(true) > 0.98 * sum(np.sum(ids > 0) for ids in log.ids)
 
 
+def test_centroids_that_are_sent_twice_count_once(log, catalogue, found):
+    columns = log.exposures.select(["x_px", "y_px", "flux"]).to_pydict().values()
+    twice = log.run(
+        catalogue, exposures=log.make_exposures(*([2 * each for each in c] for c in columns))
+    )
+    assert twice.stars.equals(found.stars)
+    assert twice.detections.equals(found.detections)
+    assert found.rejects.num_rows == 0
+    assert twice.rejects.select(["reason", "count"]).to_pylist() == [
+        {"reason": "repeated_centroid", "count": sum(len(ids) for ids in log.ids)}
+    ]
+
+
 def test_attitude_errors_are_honest(log, found):
     errors, cov = (
         log.errors(found.solutions),
@@ -260,7 +273,8 @@ def test_without_stars_the_prior_is_used_unchanged(sky, log, catalogue):
 
 def test_frames_without_attitude_are_data_and_their_centroids_have_no_direction(log, catalogue):
     empty: list[float] = []
-    x = [empty, [5.0, 9.0], [500.0] * 9, *[[1.0 * k, 7.0, 300.0, 20.0] for k in range(37)]]
+    spot = [500.0 + 0.1 * k for k in range(9)]
+    x = [empty, [5.0, 9.0], spot, *[[0.5 + k, 7.0, 300.0, 20.0] for k in range(37)]]
     found = log.run(catalogue, exposures=log.make_exposures(x, x))
     status = found.solutions["status"].to_pylist()
     assert status[:3] == ["no_centroids", "too_few_stars", "no_match"]
