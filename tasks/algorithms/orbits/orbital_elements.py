@@ -39,7 +39,8 @@ def elements_of(state: Array) -> Array:
     -------
     (..., 6) float
         Semi-major axis [km], negative for a hyperbola; eccentricity; inclination, right ascension
-        of the node, argument of perigee and mean anomaly [rad], the last three in [0, 2 pi).
+        of the node, argument of perigee and mean anomaly [rad], the last three in [0, 2 pi). That
+        of a hyperbola counts from its perigee and is negative before it: it never comes back.
 
     References
     ----------
@@ -59,9 +60,9 @@ def elements_of(state: Array) -> Array:
     beyond = np.cross(momentum, node) / np.linalg.norm(momentum, axis=-1)[..., None]
     argp = np.arctan2(np.sum(to_perigee * beyond, axis=-1), np.sum(to_perigee * node, axis=-1))
     latitude = np.arctan2(np.sum(r * beyond, axis=-1), np.sum(r * node, axis=-1))
-    return np.stack(
-        [a, e, i, raan % TURN, argp % TURN, _mean_anomaly(latitude - argp, e) % TURN], axis=-1
-    )
+    mean = _mean_anomaly(latitude - argp, e)
+    mean = np.where(e < 1, mean % TURN, mean)
+    return np.stack([a, e, i, raan % TURN, argp % TURN, mean], axis=-1)
 
 
 def _mean_anomaly(true: Array, e: Array) -> Array:

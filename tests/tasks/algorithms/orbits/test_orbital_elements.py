@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 from scenes.night_orbits import AROUND, GEO, LOW
+from scipy.integrate import solve_ivp
 from scipy.spatial.transform import Rotation
 
 from epipole.tasks.algorithms.orbits.orbital_elements import (
@@ -34,6 +35,20 @@ def test_a_hyperbola_has_a_negative_axis_and_a_mean_anomaly_that_grows_with_time
     later = state + 1.0 * np.array([*state[3:], -398600.4418 / 7000.0**2, 0, 0])
     growth = elements_of(later)[5] - elements_of(state)[5]
     assert growth == pytest.approx(np.sqrt(398600.4418 / -(a**3)), rel=1e-3)
+
+
+def test_the_mean_anomaly_of_a_hyperbola_counts_from_its_perigee_on_both_sides():
+    # A perigee at 7,000 km with 12 km/s: e is 1.53, and the path is symmetric about it.
+    at_perigee = np.array([7000.0, 0, 0, 0, 12.0, 0])
+    t_s = np.array([-3600.0, -600.0, 0.0, 600.0, 3600.0, 90_000.0])
+    path = solve_ivp(
+        lambda _, y: [*y[3:], *(-398600.4418 * y[:3] / np.linalg.norm(y[:3]) ** 3)],
+        (0.0, t_s[-1]), at_perigee, t_eval=t_s[2:], rtol=1e-11, atol=1e-9,
+    ).y.T  # fmt: skip
+    mirrored = path[[2, 1]] * [1, -1, 1, -1, 1, 1]
+    elements = elements_of(np.concatenate([mirrored, path]))
+    rate = np.sqrt(398600.4418 / -(elements[:, 0] ** 3))
+    np.testing.assert_allclose(elements[:, 5], rate * t_s, rtol=1e-6, atol=1e-9)
 
 
 def test_errors_of_elements_are_those_of_many_states():
