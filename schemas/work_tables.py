@@ -504,6 +504,12 @@ OBJECT_DETECTIONS = schema(
     ],
 )
 
+LAST_FRAMES = schema(
+    "last_frames",
+    "One row per sensor: its last frame before midnight. Two nights count its frames alike by it.",
+    [FRAMES.field(name) for name in ("sensor_id", "frame_number", "time")],
+)
+
 MOVING_OBJECTS = schema(
     "moving_objects",
     "One row per object, at the epochs of `clock_lines`: where it is and how it moves.",

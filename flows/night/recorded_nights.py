@@ -50,8 +50,8 @@ from epipole.schemas.rejects import Reason
 from epipole.schemas.settings import Settings
 from epipole.schemas.spans import DAY_NS, SPAN_NS, day_of
 from epipole.schemas.tables import NIGHTS, ORBITS, STATES
-from epipole.schemas.work_tables import OBJECT_DETECTIONS, LogSource
-from epipole.tasks.name.earlier_objects import EarlierObjects
+from epipole.schemas.work_tables import LAST_FRAMES, OBJECT_DETECTIONS, LogSource
+from epipole.tasks.name.earlier_objects import EarlierObjects, EarlierViews
 
 # The table `nights`: what a night was made from, with which settings, and what it has.
 
@@ -114,8 +114,8 @@ class EarlierNights:
     _left_out: set[str] = field(default_factory=set)  # that cannot be read
     _rows: dict[str, dict[str, Any] | None] = field(default_factory=dict)  # of `nights`
 
-    def last_views(self, night: str) -> pa.Table:
-        """Return the OBJECT_DETECTIONS of the last half hour before a night, each detection once.
+    def last_views(self, night: str) -> EarlierViews:
+        """Return the detections of the last half hour before a night, each once, and its frames.
 
         Objects that were followed over midnight keep their ids.
         """
@@ -123,7 +123,7 @@ class EarlierNights:
         start_ns = day_of(night) * DAY_NS
         between_ns = (start_ns - SPAN_NS, start_ns)
         found = self._read(before, lambda where: _views(where, before, between_ns))
-        return found or OBJECT_DETECTIONS.empty_table()
+        return found or EarlierViews(OBJECT_DETECTIONS.empty_table(), LAST_FRAMES.empty_table())
 
     def last_objects(self, night: str, settings: Settings) -> EarlierObjects:
         """Return the last states and orbits of each object before a night.
@@ -183,13 +183,22 @@ class EarlierNights:
             return None
 
 
-def _views(where: str, night: str, between_ns: tuple[int, int]) -> pa.Table:
+def _views(where: str, night: str, between_ns: tuple[int, int]) -> EarlierViews:
     def used(rows: pa.Table) -> pa.Table:
         chosen = to_polars(rows).filter("used").drop_nulls("centroid")
         return from_polars(OBJECT_DETECTIONS, chosen.unique(maintain_order=True))
 
     pieces = table_pieces(where, "associations", night, OBJECT_DETECTIONS.names, between_ns)
-    return _kept(OBJECT_DETECTIONS, map(used, pieces), f"{where}/night={night}/associations")
+    views = _kept(OBJECT_DETECTIONS, map(used, pieces), f"{where}/night={night}/associations")
+    pieces = table_pieces(where, "frames", night, LAST_FRAMES.names, between_ns)
+    frames = _kept(LAST_FRAMES, map(_last_frames, pieces), f"{where}/night={night}/frames")
+    return EarlierViews(views, _last_frames(frames))
+
+
+def _last_frames(rows: pa.Table) -> pa.Table:
+    """Return the last row of each sensor: of FRAMES, LAST_FRAMES."""
+    ordered = to_polars(rows).sort("time", "sensor_id")
+    return from_polars(LAST_FRAMES, ordered.unique("sensor_id", keep="last", maintain_order=True))
 
 
 def _last(schema: pa.Schema, where: str, night: str, between_ns: tuple[int, int]) -> pa.Table:

@@ -27,6 +27,7 @@ from epipole.io.work.work_layout import (
     SolvedParts,
     WorkFolder,
 )
+from epipole.schemas.arrays import Array
 from epipole.schemas.bridge import array, concat, to_polars
 from epipole.schemas.rejects import ObjectVerdict, Reason
 from epipole.schemas.settings import EVERY_SENSOR, Settings
@@ -44,13 +45,14 @@ from epipole.tasks.check.check_sensors import (
 from epipole.tasks.check.correct_clock import correct_clock
 from epipole.tasks.common.batches import FRAMES_OF_TASK, in_batches
 from epipole.tasks.identify.identify_span import Counts, SpanToIdentify, identify_spans
-from epipole.tasks.name.earlier_objects import EarlierObjects
+from epipole.tasks.name.earlier_objects import EarlierObjects, EarlierViews
 from epipole.tasks.name.elements_of_night import ElementsOfNight, elements_of_night
 from epipole.tasks.name.judge_times import judge_times
 from epipole.tasks.name.known_objects import name_known_objects
 from epipole.tasks.name.link_tracklets import OrbitLinks, link_tracklets
 from epipole.tasks.name.object_ids import (
     Names,
+    counted_alike,
     followed_objects,
     link_objects,
     name_objects,
@@ -260,11 +262,11 @@ def _enter_spans(parts: Parts, spans: Sequence[Span]) -> list[Span]:
 
 
 def name(
-    work: Work, solved: SolvedParts, night: str, before: pa.Table, settings: Settings
+    work: Work, solved: SolvedParts, night: str, before: EarlierViews, settings: Settings
 ) -> Names:
     """Return, for each span, the names of its objects in the night.
 
-    `before` are the OBJECT_DETECTIONS of the night before, as far as it is known.
+    `before` is the end of the night before, as far as it is known.
     """
     step(Stage.NAME, 0, 1)
     spans = [span for span in work.all_spans() if solved.holds(span)]
@@ -287,10 +289,32 @@ def name(
         if span.end_ns <= day_of(night) * DAY_NS
         for rows in solved.read(span, "associations", OBJECT_DETECTIONS.names)
     ]
-    followed = followed_objects(views, before)
+    followed = followed_objects(views, counted_alike(before, _frames_near(work, before.frames)))
     names = name_objects(linked, spans_of_night(spans, night), night, followed)
     _log_names(names, followed, len(first))
     return names
+
+
+def _frames_near(work: Work, last: pa.Table) -> dict[str, tuple[Array, Array]]:
+    """Return times [ns] and numbers of the frames about the time of each sensor's in LAST_FRAMES.
+
+    By sensor.
+    """
+    at_ns = dict(zip(last["sensor_id"].to_pylist(), array(last, "time").tolist(), strict=True))
+    found = {}
+    for sensor in work.spans:
+        if sensor.sensor_id in at_ns:
+            time_ns, parts = at_ns[sensor.sensor_id], work.identified[sensor]
+            rows = [
+                parts.read(near, "solutions", ["time", "frame_number"])
+                for near in parts.near(Span(time_ns, time_ns + 1))
+            ]
+            times, numbers = (
+                np.concatenate([np.zeros(0, np.int64), *(array(each, name) for each in rows)])
+                for name in ("time", "frame_number")
+            )
+            found[sensor.sensor_id] = times, numbers
+    return found
 
 
 def _log_names(names: Names, followed: Mapping[str, str], linked: int) -> None:

@@ -55,6 +55,13 @@ class EarlierObjects(NamedTuple):
     orbits: pa.Table
 
 
+class EarlierViews(NamedTuple):
+    """The end of the night before, as published: OBJECT_DETECTIONS, and LAST_FRAMES."""
+
+    detections: pa.Table
+    frames: pa.Table
+
+
 def recognise_objects(
     folder: Path, objects: Sequence[str], earlier: EarlierObjects, earlier_h: float, log_odds: float
 ) -> dict[str, str]:

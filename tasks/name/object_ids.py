@@ -10,14 +10,16 @@ import pyarrow.compute as pc
 
 from epipole.io.work.work_layout import SolvedParts
 from epipole.schemas.arrays import Array
-from epipole.schemas.bridge import concat, stack_covariance, to_polars
+from epipole.schemas.bridge import concat, from_polars, stack_covariance, to_polars
 from epipole.schemas.columns import POSITION, STATE_AXES, VELOCITY
 from epipole.schemas.settings import StateSettings
 from epipole.schemas.spans import Span
 from epipole.schemas.stages import Stage
 from epipole.schemas.work_tables import OBJECT_DETECTIONS
+from epipole.tasks.algorithms.constants import SECOND_NS
 from epipole.tasks.algorithms.orbits.object_linking import ObservedMotions, chains, link_by_motion
 from epipole.tasks.common.stage_tasks import stage_task
+from epipole.tasks.name.earlier_objects import EarlierViews
 
 # Objects that are detected again after a gap keep their earlier id.
 
@@ -103,6 +105,31 @@ def _seconds(ends: pl.DataFrame, name: str, origin: object) -> Array:
 # detections.
 
 _DETECTION = ["sensor_id", "frame_number", "centroid"]
+# A frame has one time in both nights, but for corrections of its clock: these differ by less.
+SAME_FRAME_S = 0.1
+
+
+def counted_alike(before: EarlierViews, frames: Mapping[str, tuple[Array, Array]]) -> pa.Table:
+    """Return the OBJECT_DETECTIONS of the night before with this night's numbers of frames.
+
+    Where a counter restarts, numbers go on from the highest one before: so they depend on which
+    logs a night was made from. What they differ by is the same in all frames of both nights.
+
+    Parameters
+    ----------
+    frames
+        Times [ns] and numbers of this night's frames, by sensor. Those near the last frame of the
+        night before are enough.
+    """
+    shifts: dict[str, int] = {}
+    for name, number, time_ns in zip(*map(before.frames.column, range(3)), strict=True):
+        times, numbers = frames.get(name.as_py(), (np.zeros(0), np.zeros(0)))
+        off_s = np.abs(times - time_ns.cast(pa.int64()).as_py()) / SECOND_NS
+        if off_s.min(initial=np.inf) < SAME_FRAME_S:
+            shifts[name.as_py()] = int(numbers[np.argmin(off_s)]) - number.as_py()
+    shift = pl.col("sensor_id").replace_strict(shifts, default=0, return_dtype=pl.Int64)
+    rows = to_polars(before.detections).with_columns(pl.col("frame_number") + shift)
+    return from_polars(OBJECT_DETECTIONS, rows)
 
 
 def followed_objects(solved: Iterable[pa.Table], published: pa.Table) -> dict[str, str]:
@@ -113,7 +140,8 @@ def followed_objects(solved: Iterable[pa.Table], published: pa.Table) -> dict[st
     solved
         OBJECT_DETECTIONS before midnight, of this night's solution.
     published
-        OBJECT_DETECTIONS of the night before, as published. Views of other times do no harm.
+        OBJECT_DETECTIONS of the night before; see `counted_alike`. Views of other times do no
+        harm.
 
     Notes
     -----

@@ -49,6 +49,20 @@ def test_an_object_that_is_followed_over_midnight_keeps_its_id(together):
     assert all(name.startswith("20190401-") for name in second)
 
 
+def test_an_object_is_followed_also_where_a_counter_restarted_earlier_that_day(log, tmp_path):
+    logs, out = tmp_path / "logs", tmp_path / "out"
+    start = START.replace(hour=10)
+    simulate("four_sensor_geo", logs / "a.mcap", seed=5, hours=10 / 3600, start=start)
+    (logs / "b.mcap").symlink_to(log)  # its frames count from 0 too
+    for night in NIGHTS:
+        nightly(str(logs / "*.mcap"), str(out), night=night)
+    restarts = pl.DataFrame(read_table(out, "rejects", NIGHTS[0]))
+    assert "restarted_counter" in restarts["reason"].to_list()
+    first, second = (set(column(out, "positions", night, "object_id")) for night in NIGHTS)
+    assert len(second) > 3
+    assert second <= first
+
+
 def test_a_night_without_the_one_before_has_ids_of_its_own(log, tmp_path):
     nightly(str(log), str(tmp_path), night=NIGHTS[1])
     names = sorted(set(column(tmp_path, "positions", NIGHTS[1], "object_id")))

@@ -13,7 +13,7 @@ from scenes.associations import filled
 from epipole.flows.night.recorded_nights import EarlierNights
 from epipole.io.datasets.night_tables import PART, write_table
 from epipole.schemas.settings import KnownObjectSettings, Settings
-from epipole.schemas.tables import ASSOCIATIONS, NIGHTS, STATES, TABLES
+from epipole.schemas.tables import ASSOCIATIONS, FRAMES, NIGHTS, STATES, TABLES
 
 NIGHT = "2019-04-03"
 START_NS = int(np.datetime64(NIGHT, "ns").astype(np.int64))
@@ -38,7 +38,7 @@ def test_the_end_of_the_night_before_is_read(tmp_path):
     write(tmp_path, "2019-04-02", [5.0, 0.4, 0.1], ["x", "y", "z"])
     write(tmp_path, "2019-04-01", [24.1], ["w"])
     nights = EarlierNights(str(tmp_path), {})
-    assert ids(nights.last_views(NIGHT)) == ["y", "z"]
+    assert ids(nights.last_views(NIGHT).detections) == ["y", "z"]
     assert ids(nights.last_objects(NIGHT, SETTINGS).states) == ["w", "x", "y", "z"]
 
 
@@ -55,13 +55,24 @@ def test_a_night_of_this_run_counts_more_than_that_of_the_dataset(tmp_path):
     write(tmp_path / "out", "2019-04-02", [0.1], ["old"])
     new = write(tmp_path / "staging", "2019-04-02", [0.1], ["new"])
     nights = EarlierNights(str(tmp_path / "out"), {"2019-04-02": new})
-    assert ids(nights.last_views(NIGHT)) == ["new"]
+    assert ids(nights.last_views(NIGHT).detections) == ["new"]
     assert ids(nights.last_objects(NIGHT, SETTINGS).states) == ["new"]
+
+
+def test_of_each_sensor_the_last_frame_before_midnight_is_read(tmp_path):
+    folder = write(tmp_path, "2019-04-02", [0.1], ["x"])
+    seconds, names = [2000.0, 9.0, 4.0, 3.0], ["c", "a", "b", "a"]
+    times = [START_NS - round(each * 1e9) for each in seconds]
+    frames = {"time": times, "sensor_id": names, "frame_number": [7, 40, 5, 46]}
+    write_table(folder, "frames", [filled(FRAMES, len(times), frames)])
+    last = EarlierNights(str(tmp_path), {}).last_views(NIGHT).frames.to_pylist()
+    found = {row["sensor_id"]: row["frame_number"] for row in last}
+    assert found == {"a": 46, "b": 5}  # the frame of c is older than half an hour
 
 
 def test_without_earlier_nights_there_are_no_rows(tmp_path):
     nights = EarlierNights(str(tmp_path / "none"), {})
-    assert nights.last_views(NIGHT).num_rows == 0
+    assert nights.last_views(NIGHT).detections.num_rows == 0
     assert nights.last_objects(NIGHT, SETTINGS).states.num_rows == 0
 
 
@@ -71,7 +82,7 @@ def test_a_damaged_night_is_left_aside_with_a_line(tmp_path, caplog):
         (folder / table / PART).write_bytes(b"no parquet")
     nights = EarlierNights(str(tmp_path), {})
     with caplog.at_level(logging.WARNING, "epipole"):
-        assert nights.last_views(NIGHT).num_rows == 0
+        assert nights.last_views(NIGHT).detections.num_rows == 0
         assert nights.last_objects(NIGHT, SETTINGS).states.num_rows == 0
     assert "not recognised from the night 2019-04-02" in caplog.text
 
@@ -111,7 +122,7 @@ def test_a_night_of_another_program_has_one_line_and_the_run_goes_on(tmp_path, a
         pq.write_table(altered(pq.read_table(path, partitioning=None)), path)
     nights = EarlierNights(str(tmp_path), {})
     with caplog.at_level(logging.WARNING, "epipole"):
-        assert nights.last_views(NIGHT).num_rows == 0
+        assert nights.last_views(NIGHT).detections.num_rows == 0
         assert ids(nights.last_objects(NIGHT, SETTINGS).states) == ["w"]
     (line,) = caplog.messages
     assert "2019-04-02" in line
@@ -135,7 +146,7 @@ from epipole.flows.night.recorded_nights import EarlierNights
 from epipole.schemas.settings import Settings
 nights = EarlierNights(sys.argv[1], {})
 key = nights.key("2019-04-03", Settings())
-views = nights.last_views("2019-04-03")
+views = nights.last_views("2019-04-03").detections
 states = nights.last_objects("2019-04-03", Settings()).states
 # Not ru_maxrss: a child begins with its parent's.
 peak_mb = int(open("/proc/self/status").read().split("VmHWM:")[1].split()[0]) // 1000

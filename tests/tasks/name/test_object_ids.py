@@ -16,9 +16,11 @@ from epipole.schemas.scene import validate_scene
 from epipole.schemas.settings import Settings
 from epipole.schemas.spans import SPAN_NS, Span
 from epipole.schemas.tables import ASSOCIATIONS, POSITIONS, STATES
-from epipole.schemas.work_tables import OBJECT_DETECTIONS
+from epipole.schemas.work_tables import LAST_FRAMES, OBJECT_DETECTIONS
 from epipole.tasks.algorithms.orbits.orbit_fit import propagate
+from epipole.tasks.name.earlier_objects import EarlierViews
 from epipole.tasks.name.object_ids import (
+    counted_alike,
     followed_objects,
     link_objects,
     name_objects,
@@ -186,6 +188,34 @@ def test_without_a_night_before_all_objects_are_new():
     own = views(("1", 1, 0, True))
     assert followed_objects([own], OBJECT_DETECTIONS.empty_table()) == {}
     assert followed_objects([], BEFORE) == {}
+
+
+def last_frames(**of_sensors: tuple[int, float]) -> pa.Table:
+    """LAST_FRAMES: the number of each sensor's frame and its time [s]."""
+    rows = [
+        {"sensor_id": name, "frame_number": number, "time": round(t * 1e9)}
+        for name, (number, t) in of_sensors.items()
+    ]
+    return pa.Table.from_pylist(rows, schema=LAST_FRAMES)
+
+
+# Of the last second before midnight: frame 2 of BEFORE is the 102nd here, and 40 ms later.
+RENUMBERED = np.array([98.54, 99.04, 99.54]) * 1e9, np.array([101, 102, 103])
+
+
+def test_objects_are_followed_although_a_counter_restarted_in_the_night_before():
+    own = views(("1", 101, 0, True), ("1", 102, 0, True), ("2", 101, 1, True))
+    before = EarlierViews(BEFORE, last_frames(a=(2, 99.0), b=(5, 99.0)))
+    alike = counted_alike(before, {"a": RENUMBERED})
+    assert followed_objects([own], alike) == {"1": "x", "2": "y"}
+    assert alike["frame_number"].to_pylist() == [101, 102, 101, 101]
+
+
+@pytest.mark.parametrize("frames", [{}, {"a": (np.array([3e9]), np.array([7]))}])
+def test_numbers_stay_where_the_last_frame_is_not_there(frames):
+    before = EarlierViews(BEFORE, last_frames(a=(2, 99.0)))
+    assert counted_alike(before, frames).equals(BEFORE)
+    assert counted_alike(before._replace(frames=last_frames()), frames).equals(BEFORE)
 
 
 MIDNIGHT_NS = int(np.datetime64("2019-04-02", "ns").astype(np.int64))
