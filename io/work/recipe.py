@@ -10,8 +10,9 @@ from typing import NamedTuple
 from epipole.schemas.options import catalogue_of_runs
 from epipole.schemas.settings import Settings
 
-# Another version may change the last bits of a result.
-LIBRARIES = ("numba", "numpy", "polars", "pyarrow", "pyerfa", "scipy")
+# Another version may change the last bits of a result; that of the table of the Earth's orientation
+# where sensors are, and that of SGP4 which object has which name.
+LIBRARIES = ("astropy-iers-data", "numba", "numpy", "polars", "pyarrow", "pyerfa", "scipy", "sgp4")
 
 
 class Recipe(NamedTuple):

@@ -1,5 +1,9 @@
 """Recipes: all that a night depends on is in its keys, and nothing else."""
 
+from importlib import metadata
+
+import pytest
+
 from epipole.io.work.recipe import code_key, digest_of, logs_key, recipe_of
 from epipole.schemas.given_settings import validate_settings
 from epipole.schemas.settings import Settings
@@ -47,6 +51,15 @@ def test_a_star_catalogue_counts_by_its_bytes(tmp_path):
         settings = validate_settings({"identification": {"catalogue": str(file)}}, "test")
         keys.append(recipe_of("", settings).star_catalogue)
     assert keys[0] == keys[2] != keys[1]
+
+
+@pytest.mark.parametrize("library", ["astropy-iers-data", "numpy", "sgp4"])
+def test_a_night_made_with_another_version_of_what_its_rows_depend_on_is_another_one(
+    library, monkeypatch
+):
+    before, version = code_key(), metadata.version
+    monkeypatch.setattr(metadata, "version", lambda name: version(name) + "+" * (name == library))
+    assert code_key.__wrapped__() != before
 
 
 def test_digests_do_not_run_together():
