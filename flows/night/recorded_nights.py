@@ -33,7 +33,7 @@ from epipole.io.datasets.dataset import (
 )
 from epipole.io.datasets.night_tables import read_columns, write_table
 from epipole.io.datasets.table_pieces import MAX_BYTES, within_bounds
-from epipole.io.logs.logged_times import open_mcap, read_digest
+from epipole.io.logs.logged_times import ReadBytes, open_mcap, read_digest
 from epipole.io.work.recipe import Recipe, digest_of, logs_key, recipe_of
 from epipole.schemas.bridge import (
     array,
@@ -303,12 +303,12 @@ class MadeFrom(NamedTuple):
 
     names : of those that did
     empty : names and sizes of those that gave nothing
-    digests : by their names, of those that are known
+    read : by their names, what was read of those of one name
     """
 
     names: set[str]
     empty: set[tuple[str, int]]
-    digests: Mapping[str, str] = MappingProxyType({})
+    read: Mapping[str, ReadBytes] = MappingProxyType({})
 
 
 def night_logs_key(given: FoundLogs, night: str, made: MadeFrom) -> str:
@@ -319,8 +319,8 @@ def night_logs_key(given: FoundLogs, night: str, made: MadeFrom) -> str:
     until_ns = end_ns(night)
     paths = _logs_of(given, night, made)
     with ThreadPoolExecutor(HASHED_AT_ONCE, "hash logs") as pool:
-        known = [made.digests.get(name_of(path)) for path in paths]
-        digests = list(pool.map(read_digest, paths, [until_ns] * len(paths), known))
+        read = [made.read.get(name_of(path)) for path in paths]
+        digests = list(pool.map(read_digest, paths, [until_ns] * len(paths), read))
     return logs_key(zip(map(name_of, paths), digests, strict=True))
 
 
@@ -336,8 +336,8 @@ def gave_something(sources: Sequence[LogSource], rejects: pa.Table, night: str) 
         if (log.first_time_ns or 0) // DAY_NS <= day <= (log.last_time_ns or 0) // DAY_NS
     }
     names = Counter(log.name for log in sources)
-    whole = {log.name: log.sha256 for log in sources if names[log.name] == 1}
-    return MadeFrom(of_night, _empty(rejects), whole)
+    read = {log.name: ReadBytes(log.sha256, log.size) for log in sources if names[log.name] == 1}
+    return MadeFrom(of_night, _empty(rejects), read)
 
 
 def _empty(rejects: pa.Table) -> set[tuple[str, int]]:

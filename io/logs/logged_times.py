@@ -75,7 +75,14 @@ def read_log_times(path: str | os.PathLike[str]) -> tuple[int, int] | None:
     return (min(times), max(times)) if times else None
 
 
-def read_digest(path: str, until_ns: int, whole: str | None = None) -> str:
+class ReadBytes(NamedTuple):
+    """What a run has read of a log: all its bytes at that time."""
+
+    sha256: str
+    size: int
+
+
+def read_digest(path: str, until_ns: int, read: ReadBytes | None = None) -> str:
     """Return the SHA-256 of a log; of one that goes on after a time, of its bytes before.
 
     These end where the first chunk begins whose messages were all logged at that time or after it.
@@ -83,8 +90,9 @@ def read_digest(path: str, until_ns: int, whole: str | None = None) -> str:
 
     Parameters
     ----------
-    whole
-        The digest of the whole log, if it is known.
+    read
+        What a run has read of it. The log may have grown since: what came before that time and was
+        not read is not in the digest, so that the next run finds it.
     """
     with open_mcap(path) as data:
         try:
@@ -92,8 +100,10 @@ def read_digest(path: str, until_ns: int, whole: str | None = None) -> str:
         except ChunkError:
             chunks = []
         after = [chunk.at for chunk in chunks if chunk.start_ns >= until_ns]
+        if read is not None and (not after or min(after) > read.size):
+            return read.sha256
         if not after:
-            return whole or data.sha256()
+            return data.sha256()
         digest = hashlib.sha256()
         for at in range(0, min(after), HASHED_BYTES):
             digest.update(data.view(at, min(at + HASHED_BYTES, *after)))

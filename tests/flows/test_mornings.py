@@ -10,6 +10,7 @@ from typer.testing import CliRunner
 from epipole.flows.command_line.main import app
 from epipole.flows.night.log_choice import find_logs
 from epipole.flows.night.recorded_nights import unchanged_nights
+from epipole.flows.night.stages import read
 from epipole.flows.nightly import nightly
 from epipole.io.datasets.dataset import read_table
 from epipole.io.logs.writer import LogWriter
@@ -78,6 +79,37 @@ def test_logs_that_give_nothing_are_on_no_night_and_open_ones_on_their_own(tmp_p
     assert unchanged(folder, out, None) == list(DAYS)
     shutil.copy(folder / "second.mcap", folder / "z.mcap")
     assert unchanged(folder, out, None) == list(DAYS)  # a copy adds nothing
+
+
+def test_a_log_whose_copy_is_complete_only_after_it_was_read_makes_its_night_again(
+    tmp_path, monkeypatch
+):
+    folder, out = tmp_path / "logs", tmp_path / "out"
+    folder.mkdir()
+    log = folder / "a.mcap"
+    with LogWriter(tmp_path / "whole.mcap", chunk_size=1, compression="none") as two_days:
+        for day in DAYS:
+            start_ns = int(np.datetime64(f"{day}T04:00", "ns").astype(np.int64))
+            two_days.camera("a", start_ns, OPTICS)
+            for k in range(10):
+                t, centroid = start_ns + k * SECOND_NS, {"x_px": [1.0], "y_px": [2.0]}
+                two_days.frame("a", t, frame_number=k, exposure_s=0.1, **centroid)
+    whole = (tmp_path / "whole.mcap").read_bytes()
+    log.write_bytes(whole[: len(whole) // 4])
+
+    def read_before_the_rest_came(*given):
+        frames = read(*given)
+        log.write_bytes(whole)
+        return frames
+
+    monkeypatch.setattr("epipole.flows.nightly.read", read_before_the_rest_came)
+    nightly(str(folder), str(out), PLAIN, night=DAYS[0])
+    assert read_table(out, "frames", DAYS[0]).num_rows < 10
+    assert unchanged(folder, out, DAYS[0]) == []
+    monkeypatch.undo()
+    nightly(str(folder), str(out), PLAIN, night=DAYS[0])
+    assert read_table(out, "frames", DAYS[0]).num_rows == 10
+    assert unchanged(folder, out, DAYS[0]) == [DAYS[0]]
 
 
 def test_late_logs_make_their_nights_again_in_order(tmp_path, monkeypatch, no_early_server):

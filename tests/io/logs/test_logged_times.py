@@ -1,10 +1,12 @@
 """When messages were logged, and the bytes of a log up to a time, while the log is written."""
 
+import hashlib
+
 import fsspec
 import pytest
 from mcap.writer import Writer
 
-from epipole.io.logs.logged_times import read_digest, read_log_times
+from epipole.io.logs.logged_times import ReadBytes, read_digest, read_log_times
 from epipole.io.logs.writer import LogWriter
 
 START_NS, SECOND_NS = 1_554_091_200_000_000_000, 1_000_000_000
@@ -50,7 +52,20 @@ def test_what_is_logged_after_a_time_does_not_change_the_digest(closed):
     of_open = [read_digest(str(path), until) for until in (early, late)]
     assert of_open[0] == of_closed[0]
     assert of_open[1] != of_closed[1]
-    assert read_digest(str(path), late, "known") == "known"
+    assert read_digest(str(path), late, ReadBytes("known", 1000)) == "known"
+
+
+def test_of_a_log_that_grew_since_it_was_read_only_what_was_read_counts(closed):
+    """A night that was made from half a copy must not be known as made from the whole."""
+    data, until_ns = closed.read_bytes(), START_NS + 20 * SECOND_NS
+    before = read_digest(str(closed), until_ns)
+    for share, is_all in ((0.3, False), (0.9, True)):
+        part = data[: int(share * len(data))]
+        read = ReadBytes(hashlib.sha256(part).hexdigest(), len(part))
+        assert (read_digest(str(closed), until_ns, read) == before) == is_all
+        closed.write_bytes(part)
+        assert read_digest(str(closed), until_ns, read) == (before if is_all else read.sha256)
+        closed.write_bytes(data)
 
 
 def test_a_closed_log_without_statistics_tells_its_times_by_its_chunks(tmp_path):
