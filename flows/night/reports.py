@@ -3,7 +3,7 @@
 import contextlib
 import dataclasses
 import logging
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 
 from epipole.flows.night.run_records import new_broken_logs
@@ -42,16 +42,17 @@ def with_reports(summary: Summary, staged: Mapping[str, Path], write: bool) -> S
     """
     extracts: list[ReportExtract] = []
     looks: dict[str, list[str]] = {}
+    write = write and _can_draw()
     try:
-        write = write and _can_draw()
         nights = nights_in(summary.dataset)
-    except Exception as error:  # of the library that draws, of the store
+    except Exception as error:  # of the store
         LOGGER.warning("no report could be made: %s", line_of(error))
         return summary
     for night in summary.nights:
-        try:
+        with _as_warning(night):
             # It shows the night as it was before: until the new one is written there is none.
             remove_beside(summary.dataset, REPORTS, f"{night}.html")
+        with _as_warning(night):
             folder = staged[night] if staged[night].is_dir() else None
             facts = night_facts(summary.dataset, night, nights, folder)
             broken = new_broken_logs(summary.dataset, night)
@@ -60,24 +61,37 @@ def with_reports(summary: Summary, staged: Mapping[str, Path], write: bool) -> S
                 text, extract = _page_and_extract(facts)
                 write_beside(summary.dataset, REPORTS, f"{night}.html", text.encode())
                 extracts.append(extract)
-        except Exception as error:  # of drawing, of the store, of anything: the night is done
-            LOGGER.warning("the report of %s could not be made: %s", night, line_of(error))
     return dataclasses.replace(summary, extracts=tuple(extracts), looks=looks)
 
 
+@contextlib.contextmanager
+def _as_warning(night: str) -> Iterator[None]:
+    """Turn any error of a report, of drawing or of the store, into a line: the night is done."""
+    try:
+        yield
+    except Exception as error:
+        LOGGER.warning("the report of %s could not be made: %s", night, line_of(error))
+
+
 def _can_draw() -> bool:
-    """Return whether reports can be drawn; if not, a line says why."""
+    """Return whether reports can be drawn; if not, a line says why.
+
+    The looks of the nights do not depend on it.
+    """
     try:
         _drawing()
     except ReportError as error:
         LOGGER.info("no report is written: %s", error)
+        return False
+    except Exception as error:  # of a library that does not fit the others
+        LOGGER.warning("no report could be drawn: %s", line_of(error))
         return False
     return True
 
 
 def load_drawing() -> None:
     """Import what draws reports, which takes a while."""
-    with contextlib.suppress(ReportError):  # it is reported when a report is to be drawn
+    with contextlib.suppress(Exception):  # it is reported when a report is to be drawn
         _drawing()
 
 

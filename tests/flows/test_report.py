@@ -60,9 +60,12 @@ def write_earlier_pages(dataset, nights):
         (dataset / "reports" / f"{night}.html").write_text("the night as it was before")
 
 
-def test_without_drawing_every_night_is_looked_at(night_run, tmp_path, monkeypatch):
+@pytest.mark.parametrize(
+    "error", [ReportError("the report needs matplotlib"), AttributeError("of another version")]
+)
+def test_without_drawing_every_night_is_looked_at(night_run, tmp_path, monkeypatch, error):
     def missing():
-        raise ReportError("the report needs matplotlib")
+        raise error
 
     dataset, summary = night_run
     nights = [NIGHT, "2019-04-02"]
@@ -70,11 +73,24 @@ def test_without_drawing_every_night_is_looked_at(night_run, tmp_path, monkeypat
         shutil.copytree(dataset / f"night={NIGHT}", tmp_path / f"night={night}")
     summary = dataclasses.replace(summary, dataset=str(tmp_path), nights=nights)
     monkeypatch.setattr(reports, "_drawing", missing)
+    reports.load_drawing()  # before a run: it goes on
     write_earlier_pages(tmp_path, [*nights, "2019-03-31"])
     made = reports.with_reports(summary, dict.fromkeys(nights, tmp_path / "none"), write=True)
     assert [page.name for page in (tmp_path / "reports").iterdir()] == ["2019-03-31.html"]
     assert sorted(made.looks) == nights
     assert made.extracts == ()
+
+
+def test_an_earlier_report_that_cannot_be_removed_hides_no_look(night_run, tmp_path, monkeypatch):
+    def failing(*_):
+        raise DatasetError("connection lost")
+
+    dataset, summary = night_run
+    shutil.copytree(dataset / f"night={NIGHT}", tmp_path / f"night={NIGHT}")
+    summary = dataclasses.replace(summary, dataset=str(tmp_path))
+    monkeypatch.setattr(reports, "remove_beside", failing)
+    made = reports.with_reports(summary, {NIGHT: tmp_path / "none"}, write=False)
+    assert sorted(made.looks) == [NIGHT]
 
 
 def test_a_report_that_fails_stops_no_other(night_run, tmp_path, monkeypatch):
