@@ -31,6 +31,7 @@ from epipole.io.datasets.dataset import (
     nights_in,
 )
 from epipole.io.logs.listing import list_logs
+from epipole.io.paths import line_of
 from epipole.io.settings_file import read_settings
 from epipole.schemas.errors import EpipoleError, NoFramesError
 from epipole.schemas.given_settings import with_assumptions
@@ -153,15 +154,20 @@ class Nights:
                 yield night.date
 
     def _unchanged(self, night: str | None) -> Summary | None:
-        """Return the summary of what need not be made again. This needs no Prefect."""
+        """Return the summary of what need not be made again. This needs no Prefect.
+
+        A night of which the logs cannot be found or read is recorded here: no flow run does it.
+        """
         if self._options.again:
             return None
         used = Stopwatch.start()
         try:
             given = find_logs(self._logs, night, self._logged)
-        except NoFramesError as error:
+        except EpipoleError as error:
             if night is not None:
-                write_record(self._out, night, RunState.NO_FRAMES, str(error), used, self._settings)
+                is_empty = isinstance(error, NoFramesError)
+                state = RunState.NO_FRAMES if is_empty else RunState.FAILED
+                write_record(self._out, night, state, line_of(error), used, self._settings)
             raise
         same = unchanged_nights(self._out, given, night, self._settings, self._known_key)
         locations = {date: night_location(self._out, date) for date in same}

@@ -1,5 +1,6 @@
 """What an operator meets in the morning: logs that are empty, open or late, and sensors missing."""
 
+import json
 import shutil
 from pathlib import Path
 
@@ -141,6 +142,18 @@ def test_late_logs_make_their_nights_again_in_order(tmp_path, monkeypatch, no_ea
     assert ended.stdout.splitlines() == ["no night"]
     ended = CliRunner().invoke(app, [*asked, "--night", "yesterday", "--last-nights", "2"])
     assert ended.stdout.splitlines()[-1] == "2 without frames"
+
+
+def test_a_night_whose_logs_cannot_be_read_is_recorded_as_failed_by_the_command_too(tmp_path):
+    log, out = write_log(tmp_path / "a.mcap", DAYS[0]), tmp_path / "out"
+    nightly(str(log), str(out), PLAIN, night=DAYS[0])
+    wrong = tmp_path / "b.mcap"
+    wrong.write_text("no log")
+    asked = ["run", str(log), str(wrong), "--out", str(out), "--night", DAYS[0], "--to", DAYS[1]]
+    assert CliRunner().invoke(app, asked).exit_code == 1
+    nights = json.loads(CliRunner().invoke(app, ["nights", str(out), "--json"]).stdout)["nights"]
+    assert {row["night"]: row["state"] for row in nights} == dict.fromkeys(DAYS, "failed")
+    assert all("b.mcap: not an MCAP file" in row["message"] for row in nights)
 
 
 def test_a_range_of_nights_is_made_in_order_and_again_if_asked(tmp_path):
