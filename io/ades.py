@@ -114,8 +114,9 @@ def _remarks(rows: pl.DataFrame) -> Texts:
     """Return which row it is, and what it shares with others."""
     columns = ["object_id", "sensor_id", "tracklet_id", "frame_number", "bias_sigma_arcsec"]
     texts = [
-        f"{f'object {found}, ' if found else ''}sensor {sensor}, tracklet {tracklet}, "
-        f"frame {frame}, shared sigma {bias:.3f} arcsec"
+        f"{f'object {found}, ' if found else ''}sensor {sensor}, "
+        f"{f'tracklet {tracklet}, ' if tracklet else ''}frame {frame}, "
+        f"shared sigma {bias:.3f} arcsec"
         for found, sensor, tracklet, frame, bias in rows.select(columns).iter_rows()
     ]
     return np.array([as_ascii(each).translate(_UNUSABLE)[:LONGEST_REMARK] for each in texts], str)

@@ -78,6 +78,15 @@ def test_times_are_those_of_the_rows_to_the_microsecond(tmp_path, schema):
     assert np.abs(off).max() <= 500
 
 
+def test_a_remark_names_a_tracklet_only_where_there_is_one(tmp_path, schema):
+    rows = observations(object_id=["o"] * 3, tracklet_id=["t", None, "t"], sensor_id=["s"] * 3)
+    found = [
+        each["remarks"] for each in read_back(observation_file(rows, {}, "UNK"), tmp_path, schema)
+    ]
+    assert found[0].startswith("object o, sensor s, tracklet t, frame ")
+    assert found[1].startswith("object o, sensor s, frame ")
+
+
 def test_no_observation_is_a_file_without_rows():
     text = observation_file(observations().clear(), {}, "Hip2")
     assert text.splitlines()[0] == "# version=2022"
