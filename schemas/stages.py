@@ -47,8 +47,8 @@ class Stage(Declared):
     )
     CHECK = (
         "check",
-        "Judges each sensor's clock, ephemeris and attitude; a wrong clock is corrected and the "
-        "night tracked again, or the sensor is left out.",
+        "Judges each sensor's clock, ephemeris and attitude; a wrong one takes part without "
+        "its fault, and a wrong clock sends the night back to `track`.",
     )
     NAME = (
         "name",

@@ -27,7 +27,7 @@ from bench_real_orbits import Orbits, low_scene
 from four_sensors import SCENE
 
 sys.path.append(str(Path(__file__).parents[1]))  # for the helpers in tests/scenes
-from scenes.log_mistakes import MISTAKES, rewritten  # noqa: E402
+from scenes.log_mistakes import MISTAKES, rewritten
 
 from epipole.flows.evaluate import evaluate
 from epipole.flows.nightly import nightly
@@ -159,8 +159,10 @@ def main() -> None:
         for name, *log in logs(chosen):
             found = outcome_of(name, *log, chosen.out)
             harm = "HARM" if found.is_harmful else ""
-            print(f"{name:55} {found.positions:6d} {found.outside:6.3f} {harm:5} {found.causes}",
-                  flush=True)
+            print(
+                f"{name:55} {found.positions:6d} {found.outside:6.3f} {harm:5} {found.causes}",
+                flush=True,
+            )
 
 
 if __name__ == "__main__":
