@@ -389,6 +389,28 @@ def _direction_cov(rows: pl.DataFrame, which: str) -> Array:
     return stack_covariance(rows, f"cov_{which}_{{}}_rad2", TANGENT_AXES)
 
 
+def add_faults(
+    before: Sequence[SensorVerdict], now: Sequence[SensorVerdict]
+) -> list[SensorVerdict]:
+    """Return the verdicts on logs, of `now` on what is left of them without the faults `before`.
+
+    A sensor with another kind of fault than before disagrees.
+    """
+    known = {one.sensor_id: one for one in before if one.is_faulty}
+    total = {one.sensor_id: one for one in (*before, *now)} | known
+    for one in now:
+        if one.is_faulty and one.sensor_id in known:
+            was = known[one.sensor_id]
+            bias = np.add(was.bias, one.bias).tolist()
+            total[one.sensor_id] = was._replace(
+                cause=was.cause if one.cause == was.cause else DISAGREES,
+                offset_s=was.offset_s + one.offset_s,
+                size=math.hypot(*bias),
+                bias=(bias[0], bias[1], bias[2]),
+            )
+    return sorted(total.values())
+
+
 def add_corrections(
     before: Sequence[SensorVerdict], now: Sequence[SensorVerdict]
 ) -> list[SensorVerdict]:
