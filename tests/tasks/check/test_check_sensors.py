@@ -17,6 +17,7 @@ from epipole.tasks.check.check_sensors import (
     JudgedSights,
     SensorVerdict,
     add_corrections,
+    add_faults,
     check_sensors,
     sensor_verdicts,
 )
@@ -36,6 +37,20 @@ def test_an_offset_is_the_correction_and_what_remains_of_it():
     assert [clock.sensor_id for clock in total] == ["a", "b", "c"]
     assert total[0] == SensorVerdict("a", 0.251, 0.008, "clock", corrected=True)
     assert total[1:] == [EARLY._replace(corrected=True), SOUND]
+
+
+def test_faults_of_logs_are_those_taken_off_and_what_is_left():
+    before = [SensorVerdict("a", 0.0, 0.1, "ephemeris", 5.0, 0.3, (3.0, 4.0, 0.0), 0.2), SOUND]
+    now = [
+        SensorVerdict("a", 0.0, 0.1),
+        SOUND._replace(cause="ephemeris", size=1.0, bias=(1.0, 0.0, 0.0)),
+    ]
+    assert add_faults(before, now) == [before[0], now[1]]
+    again = SensorVerdict("a", 0.0, 0.1, "ephemeris", 1.0, 0.1, (0.0, 0.0, 12.0), 0.1)
+    (total,) = add_faults(before[:1], [again])
+    assert (total.size, total.bias) == (13.0, (3.0, 4.0, 12.0))
+    (other,) = add_faults(before[:1], [again._replace(cause="attitude")])
+    assert (other.cause, other.fault()) == ("disagrees", None)
 
 
 def test_without_views_no_clock_is_known():
