@@ -125,9 +125,12 @@ def _solve_with_faults(
         checked = check(work, solved, settings, correct=False)
         if in_doubt(checked.work, solved, checked, settings.association.window_s):
             return None
-        if not checked.left_out:
+        still_wrong = {one.sensor_id for one in verdicts if one.is_still_wrong}
+        if checked.left_out.keys() <= still_wrong:
             break
         verdicts = tuple(add_faults(verdicts, checked.work.verdicts))
+    else:
+        return None
     return Settled(work._replace(verdicts=verdicts), solved, clocks=_clocks(verdicts))
 
 

@@ -84,6 +84,11 @@ class SensorVerdict(NamedTuple):
         return self.cause == CLOCK
 
     @property
+    def is_still_wrong(self) -> bool:
+        """Whether the clock is wrong and stays so: times are as the log has them."""
+        return self.has_wrong_clock and not self.corrected
+
+    @property
     def is_faulty(self) -> bool:
         """Whether a fault is declared."""
         return self.cause != SOUND
@@ -399,8 +404,8 @@ def add_faults(
     known = {one.sensor_id: one for one in before if one.is_faulty}
     total = {one.sensor_id: one for one in (*before, *now)} | known
     for one in now:
-        if one.is_faulty and one.sensor_id in known:
-            was = known[one.sensor_id]
+        was = known.get(one.sensor_id)
+        if one.is_faulty and was is not None and not was.is_still_wrong:
             bias = np.add(was.bias, one.bias).tolist()
             total[one.sensor_id] = was._replace(
                 cause=was.cause if one.cause == was.cause else DISAGREES,

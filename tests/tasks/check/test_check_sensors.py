@@ -49,6 +49,7 @@ def test_faults_of_logs_are_those_taken_off_and_what_is_left():
     again = SensorVerdict("a", 0.0, 0.1, "ephemeris", 1.0, 0.1, (0.0, 0.0, 12.0), 0.1)
     (total,) = add_faults(before[:1], [again])
     assert (total.size, total.bias) == (13.0, (3.0, 4.0, 12.0))
+    assert add_faults([LATE], [LATE._replace(offset_s=0.3)]) == [LATE]  # it was not corrected
     (other,) = add_faults(before[:1], [again._replace(cause="attitude")])
     assert (other.cause, other.fault()) == ("disagrees", None)
 
