@@ -100,8 +100,10 @@ def check_readings(settled: Settled, frames: OrderedFrames, checks: pa.Table) ->
     work, doubt = settled.work, settled.doubt
     viewed = work.folder.viewed(work.round)
     checks = name_cut_times(checks, settled.clocks, doubt)
-    faulty = {one.sensor_id for one in work.verdicts if one.is_faulty or doubt is not None}
-    judged = judge_readings.submit(viewed, list(work.spans), work.all_spans(), faulty)
+    faulty = {one.sensor_id for one in work.verdicts if one.is_faulty}
+    judged = judge_readings.submit(
+        viewed, list(work.spans), work.all_spans(), faulty, doubt is not None
+    )
     (found,) = results(Stage.CHECK, [judged])
     added = settled.solved.added
     if doubt is not None:

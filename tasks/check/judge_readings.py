@@ -45,10 +45,12 @@ def judge_readings(
     sensors: Sequence[Sensor],
     spans: Sequence[Span],
     at_fault: Collection[str] = (),
+    in_doubt: bool = False,
 ) -> pa.Table:
     """Return CHECKS of the sensors whose views can be compared with others at the same time.
 
-    `at_fault` are the sensors of which lines of sight show a fault, of whatever cause.
+    `at_fault` are the sensors of which lines of sight show a fault, of whatever cause; `in_doubt`
+    says that it is not clear which sensor has one.
     """
     step = max(len(spans) // MAX_SPANS, 1)
     tables = [rows for span in spans[::step] for rows in _sampled(viewed, sensors, span)]
@@ -69,7 +71,8 @@ def judge_readings(
         is_explained = not concerned.isdisjoint(at_fault) and not (
             concerned <= set(at_fault) and reading.share >= MIN_SHARE_AT_FAULT
         )
-        if not is_explained:
+        is_one = reading.sensor >= 0 and reading.other < 0
+        if not (is_explained or (is_one and in_doubt)):
             found |= {name: [finding] for name in concerned}
     return checks_table(found)
 

@@ -35,6 +35,7 @@ TINY = {
     "known_objects": "--objects 6 --ages 3 --catalogue 60",
     "long_evidence": "--seeds 1 --lone 2 --minutes 0.5 --longest 600",
     "many_sensors": "ring --sensors 8",
+    "mistakes": "--kinds geo --seconds 20 --only m/s --out {folder}",
     "night": "--shares 1 --hours 0.02",
     "orbit_fits": "--seeds 1",
     "orbit_linking": "--satellites 20 --hours 0.03",
