@@ -144,7 +144,7 @@ def test_a_camera_without_a_calibration_is_calibrated(log, told_px, tmp_path, fi
     (report,) = calibrate([str(bare)], field_deg)
     assert report.camera.fx_px == pytest.approx(told_px * (1 + FOCAL), rel=2e-3)
     assert report.camera.fy_px < 0
-    assert as_dict(report)["told"] is None
+    assert as_dict(report)["stated"] is None
     assert any("no calibration in the log" in line for line in lines(report))
 
 
