@@ -124,7 +124,7 @@ class LogCheck(StrEnum):
     )
     SENSOR_FAULT = (
         "sensor_fault",
-        "Error that was added to a sensor at fault, per axis, as large as its fault; only in runs.",
+        "Error that is left of a sensor's fault, per axis; only a run has it.",
         "the sensor is not at fault",
     )
     UTC_TIMES = (

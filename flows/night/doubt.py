@@ -1,4 +1,6 @@
-"""Doubt: what is solved where sensors disagree, and who is wrong is not clear.
+"""Doubt: what is solved where sensors disagree, be it clear or not who is wrong.
+
+A sensor that is wrong takes part without its fault, or is left out.
 
 Sensors that agree with each other may be those that are wrong. So where no more sensors agree than
 not, or several sets of faults explain the lines of sight as well, no sensor is left out: the

@@ -120,11 +120,15 @@ class _Equations(NamedTuple):
 
 def _nothing_known(n: int) -> JudgedSensors:
     """Return n sound sensors without offsets."""
-    unknown, nothing = np.full(n, np.nan), np.zeros(n)
     return JudgedSensors(
-        unknown, unknown.copy(), [SOUND] * n, nothing, nothing.copy(), np.zeros((n, 3)),
-        nothing.copy(),
-    )  # fmt: skip
+        offset_s=np.full(n, np.nan),
+        sigma_s=np.full(n, np.nan),
+        cause=[SOUND] * n,
+        size=np.zeros(n),
+        size_sigma=np.zeros(n),
+        bias=np.zeros((n, 3)),
+        bias_sigma=np.zeros(n),
+    )
 
 
 def _of_other_sensors(lines: Lines, faulty: Flags) -> Lines:
