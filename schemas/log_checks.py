@@ -112,9 +112,9 @@ class LogCheck(StrEnum):
     )
     LINES_OF_SIGHT = (
         "lines_of_sight",
-        "Share of the views that meet a view of another sensor at the same time, as the states are "
-        "written; only a run compares them.",
-        "{percent:.3g} % of its views meet those of other sensors",
+        "Share of the tracklets that meet one of another sensor at the same times, as the states "
+        "are written; only a run compares them.",
+        "{percent:.3g} % of its tracklets meet those of other sensors",
     )
     SENSORS_AGREE = (
         "sensors_agree",
@@ -460,49 +460,49 @@ class LogCause(StrEnum):
     OTHER_INERTIAL_FRAME = (
         "other_inertial_frame",
         CheckVerdict.WRONG,
-        "{percent:.0f} % of the views meet those of other sensors, {share_percent:.0f} % with "
+        "{percent:.0f} % of the tracklets meet those of other sensors, {share_percent:.0f} % with "
         "states turned between TEME and GCRF (odds 10^{odds:.0f})",
         "write the frame that the states are in: GCRF for TEME, or TEME for GCRF",
     )
     AXES_OF_STATES = (
         "axes_of_states",
         CheckVerdict.WRONG,
-        "{percent:.0f} % of the views meet those of other sensors, {share_percent:.0f} % with the "
-        "states' axes exchanged or negated (odds 10^{odds:.0f})",
+        "{percent:.0f} % of the tracklets meet those of other sensors, {share_percent:.0f} % with "
+        "the states' axes exchanged or negated (odds 10^{odds:.0f})",
         "write x, y, z of the frame in their order, right-handed, z to the north",
     )
     FRAMES_AND_STATES_APART = (
         "frames_and_states_apart",
         CheckVerdict.WRONG,
-        "{percent:.0f} % of the views meet those of other sensors, {share_percent:.0f} % with "
+        "{percent:.0f} % of the tracklets meet those of other sensors, {share_percent:.0f} % with "
         "times of frames {offset_s:+.0f} s against those of states taken back (odds 10^{odds:.0f})",
         "write UTC in both, or assume `frames_ahead_s` (`--assume`)",
     )
     EARTH_FIXED_TIMES = (
         "earth_fixed_times",
         CheckVerdict.WRONG,
-        "{percent:.0f} % of the views meet those of other sensors, {share_percent:.0f} % with "
+        "{percent:.0f} % of the tracklets meet those of other sensors, {share_percent:.0f} % with "
         "states turned by {offset_s:+.0f} s of the Earth's rotation (odds 10^{odds:.0f})",
         "write all times in UTC, not GPS or TAI: ITRF states were turned to GCRF at a wrong time",
     )
     EPHEMERIDES_EXCHANGED = (
         "ephemerides_exchanged",
         CheckVerdict.WRONG,
-        "{percent:.0f} % of the views meet those of other sensors, {share_percent:.0f} % with the "
-        "ephemerides of these two exchanged (odds 10^{odds:.0f})",
+        "{percent:.0f} % of the tracklets meet those of other sensors, {share_percent:.0f} % with "
+        "the ephemerides of these two exchanged (odds 10^{odds:.0f})",
         "write each sensor's states under its id",
     )
     NO_COMMON_OBJECTS = (
         "no_common_objects",
         CheckVerdict.UNKNOWN,
-        "{percent:.3g} % of its views meet those of other sensors, and no ordinary mistake "
+        "{percent:.3g} % of its tracklets meet those of other sensors, and no ordinary mistake "
         "explains it: they look at other objects, or the mistake is not known",
     )
     VIEWS_TOO_VAGUE = (
         "views_too_vague",
         CheckVerdict.UNKNOWN,
-        "{percent:.0f} % of its views meet those of other sensors, but {share_percent:.0f} % would "
-        "without a common object: they are many, or their errors are large",
+        "{percent:.0f} % of its tracklets meet those of other sensors, but {share_percent:.0f} % "
+        "would without a common object: they are many, or their errors are large",
     )
     CLOCK_OFF = (
         "clock_off",

@@ -53,12 +53,11 @@ def check_logs(
         name: [each for each in spans if each.span.start_ns // DAY_NS == day_of(night)]
         for name, spans in zip(frames.sensors, frames.spans, strict=True)
     }
-    of_sensors = [each for spans in present.values() for each in spans]
-    extent = NightFrames(
-        min((each.first_ns for each in of_sensors), default=0),
-        max((each.last_ns for each in of_sensors), default=0),
-        settings.sensors.max_gaps,
-    )
+    between = [
+        (min(each.first_ns for each in spans), max(each.last_ns for each in spans))
+        for spans in present.values() if spans
+    ]  # fmt: skip
+    extent = NightFrames.of_most(between, settings.sensors.max_gaps)
     expected = usual if settings.sensors.expected is None else settings.sensors.expected
     absent = absent_sensors(name for name in expected if not present.get(name))
     futures = [

@@ -1,5 +1,6 @@
 """Judge readings: whether lines of sight meet as the states are written, or read otherwise."""
 
+import math
 from collections.abc import Collection, Iterator, Sequence
 
 import numpy as np
@@ -7,11 +8,13 @@ import pyarrow as pa
 
 from epipole.io.catalogues.earth_orientation import read_earth_orientation
 from epipole.io.work.work_layout import ViewedParts
+from epipole.schemas.arrays import Integers
 from epipole.schemas.bridge import array, stack, stack_covariance
 from epipole.schemas.columns import TANGENT_AXES
 from epipole.schemas.spans import Sensor, Span
 from epipole.schemas.stages import Stage
 from epipole.schemas.work_tables import TEME, VIEWS
+from epipole.tasks.algorithms.constants import SECOND_NS
 from epipole.tasks.algorithms.log_checks.findings import (
     LINES_OF_SIGHT,
     SOUND,
@@ -20,22 +23,24 @@ from epipole.tasks.algorithms.log_checks.findings import (
     Finding,
 )
 from epipole.tasks.algorithms.log_checks.meeting_lines import (
-    MIN_BETTER,
-    MIN_STATED_SHARE,
     NamedReading,
     Sights,
+    StatedMeetings,
     find_reading,
-    shares_that_meet,
+    stated_meetings,
 )
 from epipole.tasks.algorithms.orbits.reference_frames import orientation_at, to_gcrf
 from epipole.tasks.common.stage_tasks import stage_task
 from epipole.tasks.read.judge_sensor import checks_table
 
 MAX_SPANS = 2  # that are looked at
-MAX_EPOCHS = 4  # of a span
-MAX_VIEWS = 100  # of an epoch: pairs are compared
-# Minimum share of a sensor's views that meet others with a reading, where a fault explains them
-# too. Where the reading is right it is 0.98 and more; an ephemeris 20 km off had 0.67 by another.
+# Epochs of a span are taken by two, so that also short tracklets are compared twice.
+MAX_TWOS, TWO_NS = 8, 10 * SECOND_NS
+MAX_PAIRS = 60_000  # of views, of a span
+MAX_VIEWS = 250  # of an epoch: some sensors are left out where there are more
+# Minimum share of a sensor's tracklets that meet others with a reading, where a fault explains
+# them too. Where the reading is right it is 0.98 and more; an ephemeris 20 km off had 0.67 of its
+# views by another.
 MIN_SHARE_AT_FAULT = 0.9
 
 
@@ -59,10 +64,8 @@ def judge_readings(
     rows = pa.concat_tables(tables)
     names = sorted(set(rows["sensor_id"].to_pylist()))
     sights = _sights(rows, names)
-    share, by_accident = shares_that_meet(sights)
-    found = {
-        name: [_as_stated(float(share[k]), float(by_accident[k]))] for k, name in enumerate(names)
-    }
+    stated = stated_meetings(sights)
+    found = {name: [_as_stated(stated, k)] for k, name in enumerate(names)}
     for reading in find_reading(sights, _gcrf_from_teme(int(array(rows, "epoch")[0]))):
         finding = _finding(reading)
         numbers = {reading.sensor, reading.other} - {-1} or set(range(len(names)))
@@ -89,26 +92,38 @@ def _sampled(viewed: ViewedParts, sensors: Sequence[Sensor], span: Span) -> Iter
         return
     epochs, at = np.unique(np.concatenate([e for e, _ in every]), return_inverse=True)
     n_views = np.bincount(at, np.concatenate([n for _, n in every]))
-    n_sensors = np.bincount(at)
-    usable = epochs[(n_sensors >= 2) & (n_views <= MAX_VIEWS)]
-    if not len(usable):
+    shared = np.bincount(at) >= 2
+    if not shared.any():
         return
-    best = usable[np.linspace(0, len(usable) - 1, min(MAX_EPOCHS, len(usable))).astype(int)]
-    for number, epoch_ns in columns.items():
-        rows = np.flatnonzero(np.isin(epoch_ns, best))
+    fewer = math.ceil(n_views[shared].max() / MAX_VIEWS)
+    best = _sampled_epochs(epochs[shared], n_views[shared].mean() / fewer)
+    for number in list(columns)[::fewer]:
+        rows = np.flatnonzero(np.isin(columns[number], best))
         if len(rows):
             yield viewed[number].read(span, "views", VIEWS.names).take(rows)
 
 
+def _sampled_epochs(epoch_ns: Integers, n_views: float) -> Integers:
+    """Return some of the epochs, by two, with not too many pairs of views at all of them."""
+    n_twos = int(np.clip(MAX_PAIRS // (n_views**2 + 1), 1, MAX_TWOS))
+    first = np.linspace(0, len(epoch_ns) - 1, min(n_twos, len(epoch_ns))).astype(int)
+    second = np.searchsorted(epoch_ns, epoch_ns[first] + TWO_NS).clip(0, len(epoch_ns) - 1)
+    return np.asarray(epoch_ns[np.union1d(first, second)])
+
+
 def _sights(rows: pa.Table, names: Sequence[str]) -> Sights:
     number = {name: k for k, name in enumerate(names)}
+    epoch_ns = array(rows, "epoch")
+    tracklets = list(zip(*(rows[c].to_pylist() for c in ("sensor_id", "tracklet_id")), strict=True))
+    numbered = {each: k for k, each in enumerate(dict.fromkeys(tracklets))}
     cov = sum(
         stack_covariance(rows, f"cov_{kind}_{{}}_rad2", TANGENT_AXES) for kind in ("noise", "bias")
     )
     v_km_s = stack(rows, "sensor_v{}_km_s")
     return Sights(
-        np.unique(array(rows, "epoch"), return_inverse=True)[1].astype(np.int64),
-        np.array([number[name] for name in rows["sensor_id"].to_pylist()], np.int64),
+        (epoch_ns - epoch_ns.min()) / SECOND_NS,
+        np.array([number[sensor_id] for sensor_id, _ in tracklets], np.int64),
+        np.array([numbered[each] for each in tracklets], np.int64),
         stack(rows, "u{}"),
         np.sqrt(np.trace(cov, axis1=1, axis2=2) / 2),
         stack(rows, "{}_km"),
@@ -123,14 +138,15 @@ def _gcrf_from_teme(time_ns: int) -> np.ndarray:
     return to_gcrf(TEME, at, np.eye(3), np.zeros((3, 3)), orientation)[0].T
 
 
-def _as_stated(share: float, by_accident: float) -> Finding:
+def _as_stated(stated: StatedMeetings, sensor: int) -> Finding:
+    share, by_accident = float(stated.share[sensor]), float(stated.by_accident[sensor])
     found = Finding(LINES_OF_SIGHT, SOUND, share, expected=1.0)
-    if not share > MIN_STATED_SHARE:
+    if stated.is_sound[sensor]:
+        return found
+    if share <= 0.5:
         return found._replace(verdict=UNKNOWN, cause="no_common_objects")
-    if share - by_accident <= MIN_BETTER:
-        facts = {"share_percent": 100 * by_accident}
-        return found._replace(verdict=UNKNOWN, cause="views_too_vague", facts=facts)
-    return found
+    facts = {"share_percent": 100 * by_accident}
+    return found._replace(verdict=UNKNOWN, cause="views_too_vague", facts=facts)
 
 
 def _finding(reading: NamedReading) -> Finding:

@@ -1,6 +1,6 @@
 """Judge the logs of a night: what is written as it says, of each sensor."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from functools import lru_cache
 from pathlib import Path
 from typing import NamedTuple
@@ -27,10 +27,11 @@ from epipole.tasks.read.judge_sensor import (
 from epipole.tasks.read.order_frames import OrderedFrames
 
 OPEN_PIECES = 64  # tables of pieces of logs whose rows are sorted by sensor once for many sensors
+WRONG_SHARE = 0.05  # of the sensors, whose times may all be wrong without a gap in those of others
 
 
 class NightFrames(NamedTuple):
-    """The times [ns] of the first and the last frame of a night, of any sensor.
+    """The times [ns] between which the sensors of a night have frames.
 
     `max_gaps` is the largest share of the night in which a sensor may have no frames.
     """
@@ -38,6 +39,24 @@ class NightFrames(NamedTuple):
     first_ns: int
     last_ns: int
     max_gaps: float
+
+    @classmethod
+    def of_most(cls, between_ns: Sequence[tuple[int, int]], max_gaps: float) -> "NightFrames":
+        """Return the times that no single sensor decides, of three and more.
+
+        Where the times of one are wrong, the others have no gap for that.
+
+        Parameters
+        ----------
+        between_ns
+            First and last frame of each sensor.
+        """
+        if not between_ns:
+            return cls(0, 0, max_gaps)
+        first, last = (sorted(each) for each in zip(*between_ns, strict=True))
+        n = len(between_ns)
+        outside = 1 + int(WRONG_SHARE * n) if n > 2 else 0
+        return cls(first[outside], last[-1 - outside], max_gaps)
 
 
 class JudgedSensor(NamedTuple):

@@ -1,9 +1,12 @@
 """Meeting lines: which reading of the sensors' states makes their lines of sight meet.
 
-Two sensors that see one object have it in one plane with themselves. Where no views meet as the
-states are written, ordinary mistakes are tried: for all sensors, for one, and exchanged
-ephemerides. A reading is named only if nearly all views of the sensors concerned meet with it, and
-far more than the number of views explains.
+Two sensors that see one object have it in one plane with themselves, at each epoch. Of two
+tracklets that have nothing in common, lines pass each other by chance rarely, and seldom at several
+epochs. So each tracklet's best partner among those of other sensors tells, by how far their lines
+miss each other, whether states are read as they were meant. Where few tracklets meet as the states
+are written, ordinary mistakes are tried: for all sensors, for one, and exchanged ephemerides. What
+share of the tracklets has a partner is estimated too, so a reading is named also where sensors look
+everywhere and most objects are seen by one.
 """
 
 from collections.abc import Iterator, Sequence
@@ -11,42 +14,48 @@ from itertools import combinations, permutations, product
 from typing import NamedTuple
 
 import numpy as np
+from scipy.special import erfc
 
 from epipole.schemas.arrays import Array, Flags, Integers
 from epipole.tasks.algorithms.constants import EARTH_RATE_RAD_S
 from epipole.tasks.algorithms.earth_gravity import propagate_states
 
-GATE = 3.0  # sigmas of the distance from the plane
+GATE = 3.0  # sigmas of the miss; its root mean square over the epochs that two tracklets share
 UNRELATED_RAD = 0.02  # views that have nothing in common miss each other by about this, or more
 TURN_RAD, N_TURNS = 0.05, 4  # 1-sigma per axis, of views that shall have nothing in common
 MIN_SINE = 0.1  # of the angle between a view and the baseline: along it everything meets
 NEAREST_KM, FARTHEST_KM = 1.0, 2e5  # range of an object
-MEETS = 0.9  # share of the views that meet where the reading is right
-MIN_VIEWS = 4  # of a sensor at one epoch on average: fewer decide nothing
-MIN_SHARE = 0.6  # of the views concerned, that meet with the reading that is named
+SHARES = np.array([0.02, 0.05, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 0.95, 0.98])
+MIN_MET = 4  # tracklets concerned that have a partner: fewer decide nothing
+# Part of the share of the tracklets with a partner, of the other sensors, that a sensor must have
+# with the reading that is named.
+MIN_SHARE = 0.6
 MAX_STATED_SHARE = 0.8  # with more as stated nothing is tried
-MIN_STATED_SHARE = 0.5  # with less the sensor has no common objects, or a mistake
-MIN_BETTER = 0.2  # share of the views that meet only with the reading that is named
-MIN_GAIN = 10.0  # log odds against the stated reading
+MIN_BETTER = 0.2  # part of the tracklets with a partner, that have it only with the reading
+MIN_GAIN = 8.0  # log odds against the stated reading
 MIN_LEAD = 5.0  # log odds against any other
+MIN_SOUND = 3.0  # log odds that a sensor's tracklets have partners as the states are written
 OFFSETS_S = (18.0, -18.0, 37.0, -37.0, 3600.0, -3600.0)  # GPS, TAI, an hour
 STEPS = 120  # of an hour: half a minute each
-MAX_SENSORS = 12  # whose ephemerides are exchanged in pairs
+MAX_SENSORS = 32  # whose ephemerides are exchanged in pairs
 
 
 class Sights(NamedTuple):
     """Views of n objects at some epochs, each epoch with views of two sensors or more.
 
-    epoch, sensor : (n,) int
-        Numbers from 0.
+    epoch_s : (n,) float
+        Times from any on [s].
+    sensor, tracklet : (n,) int
+        Numbers from 0; a tracklet is of one sensor.
     u : (n, 3) float
         Directions, GCRF; `sigma_rad` (n,) their 1-sigma errors per axis.
     r_km, v_km_s : (n, 3) float
         Sensors, GCRF; `position_sigma_km` (n,).
     """
 
-    epoch: Integers
+    epoch_s: Array
     sensor: Integers
+    tracklet: Integers
     u: Array
     sigma_rad: Array
     r_km: Array
@@ -55,7 +64,10 @@ class Sights(NamedTuple):
 
 
 class NamedReading(NamedTuple):
-    """A reading that makes lines meet: `sensor` is -1 where all sensors have the mistake."""
+    """A reading that makes lines meet: `sensor` is -1 where all sensors have the mistake.
+
+    Shares are those of the tracklets concerned that meet one of another sensor.
+    """
 
     cause: str
     sensor: int
@@ -64,6 +76,75 @@ class NamedReading(NamedTuple):
     stated_share: float
     log_odds: float
     offset_s: float = 0.0
+
+
+class StatedMeetings(NamedTuple):
+    """How tracklets of each sensor agree with those of others, as the states are written.
+
+    share, by_accident : (sensors,) float
+        Of its tracklets that meet one of another sensor; and of those that would anyway.
+    log_odds : (sensors,) float
+        That tracklets have partners, against that none has.
+    """
+
+    share: Array
+    by_accident: Array
+    log_odds: Array
+
+    @property
+    def is_sound(self) -> Flags:
+        """Whether each sensor's tracklets have partners among those of others."""
+        return np.asarray(self.log_odds > MIN_SOUND)
+
+
+class _Pairs(NamedTuple):
+    """Views of two sensors at one epoch, (m,) rows a and b, by the pair of tracklets.
+
+    `number` (m,) is that of the pair, `tracklets` (pairs, 2) are its two. `survival` is the part
+    of the unrelated pairs that meet at one epoch which meet at the others too.
+    """
+
+    a: Integers
+    b: Integers
+    number: Integers
+    tracklets: Integers
+    survival: float = 1.0
+
+    def of(self, concerned: Flags) -> "_Pairs":
+        """Return the pairs with a view that is concerned (n,)."""
+        wanted = concerned[self.a] | concerned[self.b]
+        return self._replace(a=self.a[wanted], b=self.b[wanted], number=self.number[wanted])
+
+
+class _Partners(NamedTuple):
+    """The best partner of each tracklet: its miss [sigma], infinite where none is in the gate.
+
+    `density` (tracklets,) is the number of unrelated ones expected per sigma of the miss.
+    """
+
+    miss: Array
+    density: Array
+
+    def of(self, tracklets: Flags) -> "_Partners":
+        return _Partners(self.miss[tracklets], self.density[tracklets])
+
+    @property
+    def share(self) -> float:
+        """The share of the tracklets that have a partner."""
+        return float(np.isfinite(self.miss).mean()) if len(self.miss) else 0.0
+
+    def log_odds(self) -> float:
+        """Return the log odds that a share of the tracklets has partners, against none.
+
+        The share is the most likely one. The nearest of the partners is at `miss`: either the true
+        one, with no other nearer, or another, with the true one farther away.
+        """
+        usable = self.density > 0
+        z, density = self.miss[usable], self.density[usable]
+        true = np.sqrt(2 / np.pi) * np.exp(-(np.minimum(z, 1e2) ** 2) / 2) / density
+        ratio = np.where(np.isfinite(z), true + erfc(z / np.sqrt(2)), 0.0)
+        odds = np.log1p(SHARES[:, None] * (ratio - 1)).sum(axis=1)
+        return float(max(odds.max(initial=0.0), 0.0))
 
 
 class _Tried(NamedTuple):
@@ -82,132 +163,206 @@ def find_reading(sights: Sights, R_gcrf_from_teme: Array) -> list[NamedReading]:
     R_gcrf_from_teme : (3, 3) float
         Rotation at the time of the views.
     """
-    n_sensors = int(sights.sensor.max(initial=-1)) + 1
-    n_epochs = max(len(np.unique(sights.epoch)), 1)
-    if n_sensors < 2 or len(sights.epoch) < MIN_VIEWS * n_epochs:
+    pairs = _pairs(sights)
+    if not len(pairs.a):
         return []
-    odds, meets = _odds(sights, sights.r_km)
-    shares = np.bincount(sights.sensor, meets) / np.maximum(np.bincount(sights.sensor), 1)
-    if meets.mean() <= MAX_STATED_SHARE:
-        every = np.ones(len(meets), bool)
-        tried = [*_of_all(sights, R_gcrf_from_teme), *_exchanged(sights, range(n_sensors))]
-        best = _best(sights, tried, odds, meets, every)
-        if best:
+    sensor_of = _sensor_of(sights)
+    stated = _partners(sights, pairs, sights.r_km)
+    changed = list(_changed(sights.r_km, sights.v_km_s, R_gcrf_from_teme))
+    n_sensors = len(np.unique(sensor_of))
+    if stated.share <= MAX_STATED_SHARE:
+        tried = [_Tried(cause, -1, -1, r_km, offset_s) for cause, r_km, offset_s in changed]
+        # With two sensors, an exchange turns the baseline, as negated axes do.
+        tried += list(_exchanged(sights, [0, 1])) if n_sensors == 2 else []
+        every = np.ones(len(sensor_of), bool)
+        if best := _best(sights, pairs, tried, stated, every, 0.0):
             return best
-    alone = np.flatnonzero(shares <= MAX_STATED_SHARE).tolist()
-    if len(alone) >= 2:
-        concerned = np.isin(sights.sensor, alone)
-        best = _best(sights, list(_exchanged(sights, alone)), odds, meets, concerned)
-        if best:
-            return best
-    found = []
-    for sensor in alone if n_sensors > 2 else []:
-        mine = sights.sensor == sensor
-        if mine.sum() < MIN_VIEWS * n_epochs or meets[~mine].mean() <= MIN_STATED_SHARE:
-            continue  # the others meet nothing either
-        tried = list(_of_one(sights, sensor, R_gcrf_from_teme))
-        found += _best(sights, tried, odds, meets, mine)
+    if n_sensors == 2:
+        return []
+    of_each = [stated.of(sensor_of == k) for k in range(n_sensors)]
+    alone = [
+        k for k, each in enumerate(of_each)
+        if each.share <= MAX_STATED_SHARE and each.log_odds() < MIN_GAIN
+    ]  # fmt: skip
+    if found := _best_exchanges(sights, pairs, stated, sensor_of, alone):
+        return found
+    for sensor in alone:
+        others = stated.of(sensor_of != sensor)
+        if others.log_odds() < MIN_GAIN:
+            continue  # they meet nothing either
+        mine = (sights.sensor == sensor)[:, None]
+        tried = [
+            _Tried(cause, sensor, -1, np.where(mine, r_km, sights.r_km), offset_s)
+            for cause, r_km, offset_s in changed
+        ]
+        found += _best(sights, pairs, tried, stated, sensor_of == sensor, others.share)
     return found
 
 
-def shares_that_meet(sights: Sights) -> tuple[Array, Array]:
-    """Return the share of each sensor's views that meet one of another, as stated.
-
-    And the share of those that would without a common object: with many views, or large errors,
-    everything meets something. So it is with each sensor's views turned at random.
-    """
-    n = np.maximum(np.bincount(sights.sensor), 1)
-
-    def share_of(u: Array) -> Array:
-        meets = _odds(sights._replace(u=u), sights.r_km)[1]
-        return np.asarray(np.bincount(sights.sensor, meets) / n)
-
-    rng = np.random.default_rng(1)
-    turned = []
-    for _ in range(N_TURNS):
-        turn = rng.normal(0.0, TURN_RAD, (len(n), 3))[sights.sensor]
-        u = sights.u + np.cross(turn, sights.u)
-        turned.append(share_of(u / np.linalg.norm(u, axis=1, keepdims=True)))
-    return share_of(sights.u), np.mean(turned, axis=0)
+def stated_meetings(sights: Sights) -> StatedMeetings:
+    """Return how the tracklets of each sensor agree with those of others, as stated."""
+    pairs = _pairs(sights)
+    partners = _partners(sights, pairs, sights.r_km)
+    sensor_of = _sensor_of(sights)
+    of_each = [partners.of(sensor_of == k) for k in range(int(sensor_of.max(initial=-1)) + 1)]
+    accident = [np.mean(-np.expm1(-GATE * each.density)) for each in of_each]
+    return StatedMeetings(
+        np.array([each.share for each in of_each]),
+        np.array(accident, float),
+        np.array([each.log_odds() for each in of_each]),
+    )
 
 
 def _best(
-    sights: Sights, tried: list[_Tried], stated_odds: Array, stated: Flags, concerned: Flags
+    sights: Sights,
+    pairs: _Pairs,
+    tried: list[_Tried],
+    stated: _Partners,
+    concerned: Flags,
+    expected_share: float,
 ) -> list[NamedReading]:
-    """Return the reading that wins beyond doubt, if any."""
-    n_epochs = len(np.unique(sights.epoch))
+    """Return the reading that wins beyond doubt, if any.
+
+    `concerned` are the tracklets; of other sensors `expected_share` has a partner.
+    """
+    chosen = pairs.of(concerned[sights.tracklet])
+    # Where all are concerned, what two have in common is counted twice.
+    part = 0.5 if concerned.all() else 1.0
+    as_stated = stated.of(concerned)
     scores = []
     for each in tried:
-        odds, meets = _odds(sights, each.r_km, concerned)
-        # Views of the same objects at several epochs do not add up.
-        gain = float((odds - stated_odds)[concerned].sum()) / n_epochs
-        scores.append((gain, float(meets[concerned].mean()), each))
+        partners = _partners(sights, chosen, each.r_km).of(concerned)
+        gain = part * (partners.log_odds() - as_stated.log_odds())
+        scores.append((gain, partners.share, each))
     scores.sort(key=lambda score: -score[0])
     gain, share, best = scores[0]
     same = (best.cause, best.sensor, best.other)
-    rest = [score for score in scores[1:] if score[2][:3] != same]
-    lead = gain - max((score[0] for score in rest), default=-np.inf)
-    shares = (share, float(stated[concerned].mean()))
-    if gain < MIN_GAIN + np.log(len(tried)) or lead < MIN_LEAD or share < MIN_SHARE:
+    lead = gain - max((score[0] for score in scores[1:] if score[2][:3] != same), default=-np.inf)
+    is_clear = gain > MIN_GAIN + np.log(len(tried)) and lead > MIN_LEAD
+    is_usual = share >= MIN_SHARE * expected_share and share * concerned.sum() >= MIN_MET
+    if not (is_clear and is_usual and share - as_stated.share >= MIN_BETTER * share):
         return []
-    if share - shares[1] < MIN_BETTER:
-        return []
-    return [NamedReading(best.cause, best.sensor, best.other, *shares, gain, best.offset_s)]
+    return [
+        NamedReading(
+            best.cause, best.sensor, best.other, share, as_stated.share, gain, best.offset_s
+        )
+    ]
 
 
-def _odds(sights: Sights, r_km: Array, concerned: Flags | None = None) -> tuple[Array, Flags]:
-    """Return the log odds (n,) that each view meets one of another sensor, and whether it does.
+def _best_exchanges(
+    sights: Sights,
+    pairs: _Pairs,
+    stated: _Partners,
+    sensor_of: Integers,
+    alone: Sequence[int],
+) -> list[NamedReading]:
+    """Return the pairs of sensors whose ephemerides are exchanged, each sensor in one of them.
 
-    Only of the views concerned, if given.
+    Two sensors of a satellite have one ephemeris: an exchange of either with a third explains both.
     """
-    n = len(sights.epoch)
-    wanted = np.ones(n, bool) if concerned is None else concerned
-    log_missing, meets = np.zeros(n), np.zeros(n, bool)
-    for epoch in np.unique(sights.epoch):
-        rows = np.flatnonzero(sights.epoch == epoch)
-        mine = rows[wanted[rows]]
-        hit, chance = _pairs(sights, r_km, mine, rows)
-        meets[mine] = hit.any(axis=1)
-        log_missing[mine] = np.log1p(-np.minimum(chance, 0.999)).sum(axis=1)
-    by_accident = np.clip(1 - np.exp(log_missing), 1e-6, 1 - 1e-6)
-    odds = np.where(meets, np.log(MEETS / by_accident), np.log((1 - MEETS) / (1 - by_accident)))
-    return np.minimum(odds, -np.log(1e-3)), meets
+    found = []
+    tried = list(_exchanged(sights, alone))
+    for each in tried:
+        concerned = np.isin(sensor_of, [each.sensor, each.other])
+        others = stated.of(~concerned).share
+        found += _best(sights, pairs, [each], stated, concerned, others)
+    named: list[NamedReading] = []
+    for one in sorted(found, key=lambda one: -one.log_odds):
+        taken = {k for other in named for k in (other.sensor, other.other)}
+        if one.log_odds > MIN_GAIN + np.log(len(tried)) and taken.isdisjoint(
+            (one.sensor, one.other)
+        ):
+            named.append(one)
+    return named
 
 
-def _pairs(sights: Sights, r_km: Array, a: Integers, b: Integers) -> tuple[Flags, Array]:
-    """Return which of views a and b of one epoch meet (m, k), and how probable that is anyway."""
-    u_a, u_b = sights.u[a], sights.u[b]
-    d = r_km[b][None, :, :] - r_km[a][:, None, :]
-    length = np.maximum(np.linalg.norm(d, axis=2), 1e-9)
-    normal = np.cross(d, u_a[:, None, :])
-    sine = np.linalg.norm(normal, axis=2) / length
-    miss = np.einsum("ijk,jk->ij", normal, u_b) / np.maximum(length * sine, 1e-9)
-    shift = (sights.position_sigma_km[a][:, None] + sights.position_sigma_km[b]) / length
-    variance = sights.sigma_rad[a][:, None] ** 2 + sights.sigma_rad[b] ** 2
-    sigma = np.sqrt(variance + shift**2)
-    # Ranges of the nearest points of both lines.
-    cosine = u_a @ u_b.T
-    along, back = np.einsum("ijk,ik->ij", d, u_a), np.einsum("ijk,jk->ij", d, u_b)
+def _sensor_of(sights: Sights) -> Integers:
+    """Return the sensor of each tracklet."""
+    sensor_of = np.zeros(int(sights.tracklet.max(initial=-1)) + 1, np.int64)
+    sensor_of[sights.tracklet] = sights.sensor
+    return sensor_of
+
+
+def _pairs(sights: Sights) -> _Pairs:
+    """Return the views of two sensors at one epoch, and how often unrelated ones meet again."""
+    first, second = [np.zeros(0, np.int64)], [np.zeros(0, np.int64)]
+    for epoch_s in np.unique(sights.epoch_s):
+        rows = np.flatnonzero(sights.epoch_s == epoch_s)
+        rows = rows[np.argsort(sights.tracklet[rows])]  # whatever the order of the views
+        a, b = (rows[k] for k in np.triu_indices(len(rows), 1))
+        wanted = sights.sensor[a] != sights.sensor[b]
+        first.append(a[wanted])
+        second.append(b[wanted])
+    a, b = np.concatenate(first), np.concatenate(second)
+    both = np.stack([sights.tracklet[a], sights.tracklet[b]], axis=1)
+    tracklets, number = np.unique(both, axis=0, return_inverse=True)
+    pairs = _Pairs(a, b, number.reshape(-1), tracklets.reshape(-1, 2))
+    return pairs._replace(survival=_survival(sights, pairs))
+
+
+def _survival(sights: Sights, pairs: _Pairs) -> float:
+    """Return which part of unrelated pairs that meet at one epoch meet at the others too.
+
+    Unrelated are views after each sensor's are turned at random.
+    """
+    rng = np.random.default_rng(1)
+    n_sensors = int(sights.sensor.max(initial=-1)) + 1
+    met, expected = 1.0, 1.0
+    for _ in range(N_TURNS):
+        turn = rng.normal(0.0, TURN_RAD, (n_sensors, 3))[sights.sensor]
+        u = sights.u + np.cross(turn, sights.u)
+        u /= np.linalg.norm(u, axis=1, keepdims=True)
+        miss, chance = _misses(sights._replace(u=u), pairs, sights.r_km)
+        met += float((miss < GATE).sum())
+        expected += float(chance.sum())
+    return min(met / expected, 1.0)
+
+
+def _partners(sights: Sights, pairs: _Pairs, r_km: Array) -> _Partners:
+    """Return the best partner of each tracklet, of the pairs given, with sensors at r_km."""
+    miss, chance = _misses(sights, pairs, r_km)
+    n = int(sights.tracklet.max(initial=-1)) + 1
+    nearest, density = np.full(n, np.inf), np.zeros(n)
+    for side in pairs.tracklets.T:
+        np.minimum.at(nearest, side, np.where(miss < GATE, miss, np.inf))
+        density += np.bincount(side, chance, n) * pairs.survival / GATE
+    return _Partners(nearest, density)
+
+
+def _misses(sights: Sights, pairs: _Pairs, r_km: Array) -> tuple[Array, Array]:
+    """Return by how much each pair of tracklets misses, and how probable the gate is anyway.
+
+    The first is the root mean square over its epochs [sigma], infinite where lines do not meet
+    ahead of both sensors; the second is for one epoch, 0 where no epoch tells.
+    """
+    a, b = pairs.a, pairs.b
+    u_a, u_b, d = sights.u[a], sights.u[b], r_km[b] - r_km[a]
+    length = np.maximum(np.linalg.norm(d, axis=1), 1e-9)
+    normal = np.cross(d, u_a)
+    sine_a = np.linalg.norm(normal, axis=1) / length
+    sine_b = np.linalg.norm(np.cross(d, u_b), axis=1) / length
+    usable = (length > 1.0) & (sine_a > MIN_SINE) & (sine_b > MIN_SINE)
+    floor = np.maximum(sine_a, MIN_SINE)
+    miss = np.einsum("ij,ij->i", normal, u_b) / (length * floor)
+    cosine = np.einsum("ij,ij->i", u_a, u_b)
     apart = np.maximum(1 - cosine**2, 1e-12)
+    # An error of a position out of the plane moves the object by as much, seen from its range.
+    position = np.hypot(sights.position_sigma_km[a], sights.position_sigma_km[b])
+    moved = position * np.sqrt(apart) / (length * floor)
+    variance = (sights.sigma_rad[a] * sine_b / floor) ** 2 + sights.sigma_rad[b] ** 2 + moved**2
+    # Ranges of the nearest points of both lines.
+    along, back = np.einsum("ij,ij->i", d, u_a), np.einsum("ij,ij->i", d, u_b)
     range_a, range_b = (along - cosine * back) / apart, (cosine * along - back) / apart
     ahead = (range_a > NEAREST_KM) & (range_b > NEAREST_KM)
     ahead &= (range_a < FARTHEST_KM) & (range_b < FARTHEST_KM)
-    other = sights.sensor[a][:, None] != sights.sensor[b]
-    usable = other & (length > 1.0) & (sine > MIN_SINE)
-    hit = usable & ahead & (np.abs(miss) < GATE * sigma)
-    chance = np.where(usable, np.minimum(2 * GATE * sigma / UNRELATED_RAD, 1.0), 0.0)
-    return hit, chance
-
-
-def _of_all(sights: Sights, R_gcrf_from_teme: Array) -> Iterator[_Tried]:
-    for cause, r_km, offset_s in _changed(sights.r_km, sights.v_km_s, R_gcrf_from_teme):
-        yield _Tried(cause, -1, -1, r_km, offset_s)
-
-
-def _of_one(sights: Sights, sensor: int, R_gcrf_from_teme: Array) -> Iterator[_Tried]:
-    mine = (sights.sensor == sensor)[:, None]
-    for cause, r_km, offset_s in _changed(sights.r_km, sights.v_km_s, R_gcrf_from_teme):
-        yield _Tried(cause, sensor, -1, np.where(mine, r_km, sights.r_km), offset_s)
+    n = len(pairs.tracklets)
+    n_usable = np.bincount(pairs.number, usable, n)
+    is_ahead = (n_usable > 0) & (np.bincount(pairs.number, usable & ahead, n) == n_usable)
+    count = np.maximum(n_usable, 1)
+    square = np.bincount(pairs.number, np.where(usable, miss**2 / variance, 0.0), n) / count
+    chance = np.minimum(2 * GATE * np.sqrt(variance) / UNRELATED_RAD, 1.0)
+    by_accident = np.bincount(pairs.number, np.where(usable, chance, 0.0), n) / count
+    return np.where(is_ahead, np.sqrt(square), np.inf), by_accident
 
 
 def _changed(r_km: Array, v_km_s: Array, R: Array) -> Iterator[tuple[str, Array, float]]:
@@ -229,13 +384,21 @@ def _changed(r_km: Array, v_km_s: Array, R: Array) -> Iterator[tuple[str, Array,
 
 
 def _exchanged(sights: Sights, sensors: Sequence[int]) -> Iterator[_Tried]:
-    """Yield the exchange of two ephemerides, at epochs at which both sensors have views."""
-    position: dict[tuple[int, int], Array] = {}
-    for k in range(len(sights.epoch)):
-        position.setdefault((int(sights.epoch[k]), int(sights.sensor[k])), sights.r_km[k])
-    for a, b in combinations(sensors[:MAX_SENSORS], 2):
+    """Yield the exchange of two ephemerides."""
+    epoch_s, at = np.unique(sights.epoch_s, return_inverse=True)
+    chosen = list(sensors)[:MAX_SENSORS]
+    paths = {sensor: _positions_at(sights, sensor, epoch_s) for sensor in chosen}
+    for a, b in combinations(chosen, 2):
         r_km = sights.r_km.copy()
-        for k in np.flatnonzero((sights.sensor == a) | (sights.sensor == b)).tolist():
-            other = b if sights.sensor[k] == a else a
-            r_km[k] = position.get((int(sights.epoch[k]), other), r_km[k])
+        for sensor, other in ((a, b), (b, a)):
+            mine = sights.sensor == sensor
+            r_km[mine] = paths[other][at[mine]]
         yield _Tried("ephemerides_exchanged", a, b, r_km)
+
+
+def _positions_at(sights: Sights, sensor: int, epoch_s: Array) -> Array:
+    """Return a sensor's positions at other epochs, propagated from its nearest state."""
+    known = np.flatnonzero(sights.sensor == sensor)
+    nearest = known[np.abs(epoch_s[:, None] - sights.epoch_s[known]).argmin(axis=1)]
+    after_s = epoch_s - sights.epoch_s[nearest]
+    return propagate_states(sights.r_km[nearest], sights.v_km_s[nearest], after_s, STEPS)[0]

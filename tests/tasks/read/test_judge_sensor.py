@@ -10,6 +10,7 @@ from epipole.schemas.log_checks import LISTED, CheckVerdict, LogCause, LogCheck,
 from epipole.tasks.algorithms.log_checks import findings
 from epipole.tasks.algorithms.log_checks.findings import WRONG, Finding
 from epipole.tasks.read import judge_sensor
+from epipole.tasks.read.judge_logs import NightFrames
 from epipole.tasks.read.judge_sensor import checks_table, judge_log, rows_by_sensor
 
 ROOT = Path(__file__).parents[3]
@@ -120,3 +121,18 @@ def test_the_columns_of_a_log_are_searched_once_and_not_per_sensor(sound, monkey
     )
     assert judge_log(sound, GAP_S).num_rows
     assert len(calls) == 2
+
+
+@pytest.mark.parametrize("n_sensors", [3, 24])
+def test_the_times_of_one_sensor_make_no_gap_in_those_of_others(n_sensors):
+    sound = [(1000 + k, 2000 + k) for k in range(n_sensors - 1)]
+    for shift in (-500, 0, 500):
+        night = NightFrames.of_most([(1000 + shift, 2000 + shift), *sound], 0.1)
+        assert 1000 <= night.first_ns <= 1003
+        assert 1996 <= night.last_ns <= 1000 + 1000 + n_sensors
+
+
+def test_one_sensor_of_two_has_the_gap_where_the_other_has_frames():
+    assert NightFrames.of_most([(0, 50), (0, 100)], 0.1)[:2] == (0, 100)
+    assert NightFrames.of_most([(10, 50)], 0.1)[:2] == (10, 50)
+    assert NightFrames.of_most([], 0.1)[:2] == (0, 0)
