@@ -1,12 +1,12 @@
 """Meeting lines: which reading of the sensors' states makes their lines of sight meet.
 
 Two sensors that see one object have it in one plane with themselves, at each epoch. Of two
-tracklets that have nothing in common, lines pass each other by chance rarely, and seldom at several
-epochs. So each tracklet's best partner among those of other sensors tells, by how far their lines
-miss each other, whether states are read as they were meant. Where few tracklets meet as the states
-are written, ordinary mistakes are tried: for all sensors, for one, and exchanged ephemerides. What
-share of the tracklets has a partner is estimated too, so a reading is named also where sensors look
-everywhere and most objects are seen by one.
+tracklets that have nothing in common, lines seldom meet by accident, and hardly at several epochs.
+So by how far each tracklet misses the nearest one of another sensor tells whether states are read
+as they were meant. Where few tracklets meet as the states are written, ordinary mistakes are tried:
+for all sensors, for one, and exchanged ephemerides. What share of the tracklets has a counterpart
+is estimated too, so a reading is named also where sensors look everywhere and most objects are seen
+by one.
 """
 
 from collections.abc import Iterator, Sequence
@@ -26,15 +26,15 @@ TURN_RAD, N_TURNS = 0.05, 4  # 1-sigma per axis, of views that shall have nothin
 MIN_SINE = 0.1  # of the angle between a view and the baseline: along it everything meets
 NEAREST_KM, FARTHEST_KM = 1.0, 2e5  # range of an object
 SHARES = np.array([0.02, 0.05, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 0.95, 0.98])
-MIN_MET = 4  # tracklets concerned that have a partner: fewer decide nothing
-# Part of the share of the tracklets with a partner, of the other sensors, that a sensor must have
-# with the reading that is named.
+MIN_MET = 4  # tracklets concerned that have a counterpart: fewer decide nothing
+# Part of the share of the tracklets that meet another, of the other sensors, that a sensor must
+# have with the reading that is named.
 MIN_SHARE = 0.6
 MAX_STATED_SHARE = 0.8  # with more as stated nothing is tried
-MIN_BETTER = 0.2  # part of the tracklets with a partner, that have it only with the reading
+MIN_BETTER = 0.2  # part of the tracklets with a counterpart, that have it only with the reading
 MIN_GAIN = 8.0  # log odds against the stated reading
 MIN_LEAD = 5.0  # log odds against any other
-MIN_SOUND = 3.0  # log odds that a sensor's tracklets have partners as the states are written
+MIN_SOUND = 3.0  # log odds that a sensor's tracklets have counterparts as the states are written
 OFFSETS_S = (18.0, -18.0, 37.0, -37.0, 3600.0, -3600.0)  # GPS, TAI, an hour
 STEPS = 120  # of an hour: half a minute each
 MAX_SENSORS = 32  # whose ephemerides are exchanged in pairs
@@ -84,7 +84,7 @@ class StatedMeetings(NamedTuple):
     share, by_accident : (sensors,) float
         Of its tracklets that meet one of another sensor; and of those that would anyway.
     log_odds : (sensors,) float
-        That tracklets have partners, against that none has.
+        That tracklets have counterparts, against that none of them has.
     """
 
     share: Array
@@ -93,7 +93,7 @@ class StatedMeetings(NamedTuple):
 
     @property
     def is_sound(self) -> Flags:
-        """Whether each sensor's tracklets have partners among those of others."""
+        """Whether each sensor's tracklets have counterparts among those of others."""
         return np.asarray(self.log_odds > MIN_SOUND)
 
 
@@ -116,28 +116,29 @@ class _Pairs(NamedTuple):
         return self._replace(a=self.a[wanted], b=self.b[wanted], number=self.number[wanted])
 
 
-class _Partners(NamedTuple):
-    """The best partner of each tracklet: its miss [sigma], infinite where none is in the gate.
+class _Nearest(NamedTuple):
+    """The miss of each tracklet [sigma]: from the nearest one of another sensor, within `GATE`.
 
-    `density` (tracklets,) is the number of unrelated ones expected per sigma of the miss.
+    It is infinite where there is no such. `density` (tracklets,) is the number of unrelated ones
+    that is expected per sigma of the miss.
     """
 
     miss: Array
     density: Array
 
-    def of(self, tracklets: Flags) -> "_Partners":
-        return _Partners(self.miss[tracklets], self.density[tracklets])
+    def of(self, tracklets: Flags) -> "_Nearest":
+        return _Nearest(self.miss[tracklets], self.density[tracklets])
 
     @property
     def share(self) -> float:
-        """The share of the tracklets that have a partner."""
+        """The share of the tracklets that meet one."""
         return float(np.isfinite(self.miss).mean()) if len(self.miss) else 0.0
 
     def log_odds(self) -> float:
-        """Return the log odds that a share of the tracklets has partners, against none.
+        """Return the log odds that a share of the tracklets has counterparts, against none.
 
-        The share is the most likely one. The nearest of the partners is at `miss`: either the true
-        one, with no other nearer, or another, with the true one farther away.
+        The share is the most likely one. The nearest tracklet is the counterpart, with no other
+        nearer, or another one, with the counterpart farther away.
         """
         usable = self.density > 0
         z, density = self.miss[usable], self.density[usable]
@@ -167,7 +168,7 @@ def find_reading(sights: Sights, R_gcrf_from_teme: Array) -> list[NamedReading]:
     if not len(pairs.a):
         return []
     sensor_of = _sensor_of(sights)
-    stated = _partners(sights, pairs, sights.r_km)
+    stated = _nearest_of(sights, pairs, sights.r_km)
     changed = list(_changed(sights.r_km, sights.v_km_s, R_gcrf_from_teme))
     n_sensors = len(np.unique(sensor_of))
     if stated.share <= MAX_STATED_SHARE:
@@ -202,9 +203,9 @@ def find_reading(sights: Sights, R_gcrf_from_teme: Array) -> list[NamedReading]:
 def stated_meetings(sights: Sights) -> StatedMeetings:
     """Return how the tracklets of each sensor agree with those of others, as stated."""
     pairs = _pairs(sights)
-    partners = _partners(sights, pairs, sights.r_km)
+    nearest = _nearest_of(sights, pairs, sights.r_km)
     sensor_of = _sensor_of(sights)
-    of_each = [partners.of(sensor_of == k) for k in range(int(sensor_of.max(initial=-1)) + 1)]
+    of_each = [nearest.of(sensor_of == k) for k in range(int(sensor_of.max(initial=-1)) + 1)]
     accident = [np.mean(-np.expm1(-GATE * each.density)) for each in of_each]
     return StatedMeetings(
         np.array([each.share for each in of_each]),
@@ -217,13 +218,13 @@ def _best(
     sights: Sights,
     pairs: _Pairs,
     tried: list[_Tried],
-    stated: _Partners,
+    stated: _Nearest,
     concerned: Flags,
     expected_share: float,
 ) -> list[NamedReading]:
     """Return the reading that wins beyond doubt, if any.
 
-    `concerned` are the tracklets; of other sensors `expected_share` has a partner.
+    `concerned` are the tracklets; of other sensors `expected_share` meets one.
     """
     chosen = pairs.of(concerned[sights.tracklet])
     # Where all are concerned, what two have in common is counted twice.
@@ -231,9 +232,9 @@ def _best(
     as_stated = stated.of(concerned)
     scores = []
     for each in tried:
-        partners = _partners(sights, chosen, each.r_km).of(concerned)
-        gain = part * (partners.log_odds() - as_stated.log_odds())
-        scores.append((gain, partners.share, each))
+        nearest = _nearest_of(sights, chosen, each.r_km).of(concerned)
+        gain = part * (nearest.log_odds() - as_stated.log_odds())
+        scores.append((gain, nearest.share, each))
     scores.sort(key=lambda score: -score[0])
     gain, share, best = scores[0]
     same = (best.cause, best.sensor, best.other)
@@ -252,7 +253,7 @@ def _best(
 def _best_exchanges(
     sights: Sights,
     pairs: _Pairs,
-    stated: _Partners,
+    stated: _Nearest,
     sensor_of: Integers,
     alone: Sequence[int],
 ) -> list[NamedReading]:
@@ -318,15 +319,15 @@ def _survival(sights: Sights, pairs: _Pairs) -> float:
     return min(met / expected, 1.0)
 
 
-def _partners(sights: Sights, pairs: _Pairs, r_km: Array) -> _Partners:
-    """Return the best partner of each tracklet, of the pairs given, with sensors at r_km."""
+def _nearest_of(sights: Sights, pairs: _Pairs, r_km: Array) -> _Nearest:
+    """Return by how far tracklets miss the nearest ones, of the pairs, with sensors at r_km."""
     miss, chance = _misses(sights, pairs, r_km)
     n = int(sights.tracklet.max(initial=-1)) + 1
     nearest, density = np.full(n, np.inf), np.zeros(n)
     for side in pairs.tracklets.T:
         np.minimum.at(nearest, side, np.where(miss < GATE, miss, np.inf))
         density += np.bincount(side, chance, n) * pairs.survival / GATE
-    return _Partners(nearest, density)
+    return _Nearest(nearest, density)
 
 
 def _misses(sights: Sights, pairs: _Pairs, r_km: Array) -> tuple[Array, Array]:
