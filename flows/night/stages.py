@@ -132,9 +132,11 @@ def identify_all(stage: Stage, work: Work, settings: Settings) -> None:
 def track(work: Work, night: str, settings: Settings) -> Work:
     """Follow detections from frame to frame, and name tracklets; return the work with counts."""
     parts = work.sensor_parts()
+    again = {sensor for sensor in work.spans if work.corrected.get(sensor, 0) == work.round}
+    pairs = [(sensor, span) for sensor, span in work.by_span() if sensor in again]
     to_track = [
         SpanToTrack(sensor, span, parts[sensor].identified, parts[sensor].tracked)
-        for sensor, span in work.by_span()
+        for sensor, span in pairs
     ]
     futures = [
         track_spans.submit(batch, work.cameras, settings.tracklets, settings.alignment.window_s)
@@ -143,12 +145,13 @@ def track(work: Work, night: str, settings: Settings) -> Work:
     n_detections = flat(results(Stage.TRACK, futures, (0, 2)))
     to_join = [
         SensorToJoin(sensor, spans, parts[sensor].tracked, parts[sensor].names)
-        for sensor, spans in work.spans.items()
-    ]
+        for sensor, spans in work.spans.items() if sensor in again
+    ]  # fmt: skip
     futures = [join_tracklets.submit(batch, night) for batch in work.sensor_batches(to_join)]
     count = sum(results(Stage.TRACK, futures, (1, 2)))
     LOGGER.info("followed %s", many(count, "tracklet"))
-    return work._replace(n_detections=dict(zip(work.by_span(), n_detections, strict=True)))
+    found = dict(zip(pairs, n_detections, strict=True))
+    return work._replace(n_detections={**work.n_detections, **found})
 
 
 def solve(
@@ -243,8 +246,12 @@ def _correct_clocks(work: Work, wrong: Sequence[SensorVerdict], settings: Settin
         sensor: sorted([*of_sensor, *entered.get(sensor, [])])
         for sensor, of_sensor in work.spans.items()
     }
-    identified = {**work.identified, **where}
-    return work._replace(spans=spans, identified=identified, round=next_round)
+    return work._replace(
+        spans=spans,
+        identified={**work.identified, **where},
+        round=next_round,
+        corrected={**work.corrected, **dict.fromkeys(where, next_round)},
+    )
 
 
 def _enter_spans(parts: Parts, spans: Sequence[Span]) -> list[Span]:

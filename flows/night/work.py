@@ -29,7 +29,8 @@ OfSensor = TypeVar("OfSensor", SensorStars, SensorToJoin)
 class Work(NamedTuple):
     """The work of a night.
 
-    A round is one pass from `track` to `check`. After a correction of clocks comes another round.
+    A round is one pass from `track` to `check`. After a correction of clocks comes another round,
+    in which sensors with such a clock are tracked again.
     """
 
     frames: ReadFolder  # ordered by `order_sensors`
@@ -39,8 +40,9 @@ class Work(NamedTuple):
     cameras: pa.Table
     identified: dict[Sensor, Parts]  # the newest of each sensor
     round: int = 0
+    corrected: Mapping[Sensor, int] = {}  # the round in which a sensor was tracked last, if not 0
     verdicts: tuple[SensorVerdict, ...] = ()  # of the logs, before any correction
-    n_detections: Mapping[tuple[Sensor, Span], int] = {}  # in this round, from `track` on
+    n_detections: Mapping[tuple[Sensor, Span], int] = {}  # of tracklets, from `track` on
 
     def all_spans(self) -> list[Span]:
         """Return the spans in which any sensor has frames, in order."""
@@ -62,16 +64,18 @@ class Work(NamedTuple):
 
     def sensor_parts(self) -> dict[Sensor, SensorParts]:
         """Return where the parts of each sensor lie in this round."""
-        return {
-            sensor: SensorParts(
+        viewed = self.folder.viewed(self.round)
+        parts = {}
+        for sensor in self.spans:
+            tracked = self.corrected.get(sensor, 0)
+            parts[sensor] = SensorParts(
                 sensor.sensor_id,
                 self.identified[sensor],
-                self.folder.tracked(sensor, self.round),
-                self.folder.tracklet_names(sensor, self.round),
-                self.folder.viewed(self.round)[sensor.number],
+                self.folder.tracked(sensor, tracked),
+                self.folder.tracklet_names(sensor, tracked),
+                viewed[sensor.number],
             )
-            for sensor in self.spans
-        }
+        return parts
 
 
 def plan_spans(

@@ -7,6 +7,7 @@ import polars as pl
 import pytest
 
 from epipole.flows.evaluate import evaluate
+from epipole.flows.night import stages
 from epipole.schemas.scene import validate_scene
 
 pytestmark = pytest.mark.long
@@ -33,8 +34,18 @@ def scan(out, name):
 
 
 @pytest.mark.parametrize("offset_s", [-2.0, 0.2])
-def test_a_sensor_whose_clock_was_corrected_takes_part(prefect, tmp_path, offset_s):
+def test_a_sensor_whose_clock_was_corrected_takes_part(prefect, tmp_path, monkeypatch, offset_s):
+    tracked = []
+    submit = stages.track_spans.submit
+
+    def counted(batch, *others):
+        tracked.extend(each.sensor.sensor_id for each in batch)
+        return submit(batch, *others)
+
+    monkeypatch.setattr(stages.track_spans, "submit", counted)
     summary, out = run(tmp_path, offset_s)
+    others = [name for name in tracked if name != "sat3"]
+    assert (sorted(others), len(tracked) > 4) == (["sat1", "sat2", "sat4"], True)
     assert len(summary.faults) == 1
     side = "late" if offset_s > 0 else "early"
     assert summary.faults[0].startswith("the clock of sat3 is")
