@@ -22,6 +22,7 @@ from epipole.io.paths import is_one_of
 from epipole.schemas.bridge import array, to_polars
 from epipole.schemas.errors import DatasetError, LogError, NoFramesError
 from epipole.schemas.options import star_ids_of
+from epipole.schemas.settings import Assumption
 from epipole.schemas.spans import DAY_NS, SPAN_NS, Span, day_of, spans_between
 from epipole.tasks.overlay.layout import viewer_layout
 from epipole.tasks.overlay.messages import (
@@ -37,6 +38,7 @@ from epipole.tasks.overlay.messages import (
     with_objects,
 )
 from epipole.tasks.overlay.scene import earth
+from epipole.tasks.read.assume_readings import as_assumed
 
 LIFETIME_EPOCHS = 3  # an object is shown as long, if no later epoch has it
 
@@ -55,12 +57,16 @@ class Overlay:
 
 
 class _Logs:
-    """What the logs have: calibrations, sensors, and the times of the frames of each."""
+    """What the logs have: calibrations, sensors, and the times of the frames of each.
 
-    def __init__(self, paths: Sequence[str]) -> None:
+    Read as their run assumed them: the times of its tables are those that it read.
+    """
+
+    def __init__(self, paths: Sequence[str], assume: Sequence[Assumption]) -> None:
         cameras, exposures = [], []
         for path in paths:
-            for piece in read_log_pieces(path):
+            for written in read_log_pieces(path):
+                piece = as_assumed(written, assume)
                 cameras.append(piece.cameras)
                 exposures.append(piece.exposures.select(["sensor_id", "time"]))
         self.cameras: pa.Table = pa.concat_tables(cameras)
@@ -73,7 +79,12 @@ class _Logs:
 
 
 def overlay(
-    dataset: str, logs: Sequence[str], out: Path, night: str | None = None, images: bool = False
+    dataset: str,
+    logs: Sequence[str],
+    out: Path,
+    night: str | None = None,
+    images: bool = False,
+    assume: Sequence[Assumption] = (),
 ) -> Overlay:
     """Write what the dataset says of the frames of the logs, and a layout of panels beside it.
 
@@ -83,6 +94,8 @@ def overlay(
         Only this UTC date; None: all nights of the logs that the dataset has.
     images
         Also write an image for each frame, drawn from its centroids.
+    assume
+        `sensors.assume` of the run that made the dataset.
 
     Raises
     ------
@@ -92,11 +105,14 @@ def overlay(
     paths = [path for where in logs for path in list_logs(where)[0]]
     if is_one_of(out, paths):
         raise LogError(f"{out}: is one of the logs, and would be lost; give another file to write")
-    given = _Logs(paths)
+    given = _Logs(paths, assume)
     nights = [date for date in nights_in(dataset) if date in given.nights and night in (None, date)]
     if not nights:
         asked = night or ", ".join(given.nights)
-        raise NoFramesError(f"{dataset}: has no night of these logs ({asked}); run them first")
+        raise NoFramesError(
+            f"{dataset}: has no night of these logs ({asked}); run them first, or give --assume "
+            "as their run did"
+        )
     counts = {"frames": 0, "epochs": 0, "log_lines": 0}
     try:
         with ViewerFile(out) as file:

@@ -293,6 +293,7 @@ def overlay(
     images: Annotated[
         bool, typer.Option("--images", help="Also draw an image for each frame from its centroids.")
     ] = False,
+    assume: Assume = None,
     as_json: AsJson = False,
 ) -> None:
     """Draw a night over its logs, as an MCAP file for Foxglove and viewers like it.
@@ -300,11 +301,15 @@ def overlay(
     Stars ringed and named, objects with their ids, calibrations, sensors and objects in
     space with their lines of sight, and what was left out, at the times of the frames.
     Open it together with the log, with the layout of panels that is written beside it.
+    Logs that were run with --assume, or with the setting, need the same here.
     """
     from epipole.flows.overlay import overlay as write
+    from epipole.schemas.given_settings import with_assumptions
+    from epipole.schemas.settings import Settings
 
     check_night(night)
-    made = write(dataset, logs, out, night, images)
+    read_as = with_assumptions(Settings(), assume or ()).sensors.assume
+    made = write(dataset, logs, out, night, images, read_as)
     if as_json:
         print_json(asdict(made))
         return

@@ -231,6 +231,20 @@ def test_a_night_that_the_dataset_does_not_have_is_one_line(night_log, night_dat
     assert list(tmp_path.iterdir()) == []
 
 
+def test_logs_are_read_as_their_run_assumed(night_log, night_dataset, tmp_path):
+    log = api.read_log(night_log)
+    late = pl.duration(hours=21)
+    moved = [rows.with_columns(pl.col("time") + late) for rows in log[:3]]
+    api.write_log(tmp_path / "local.mcap", *moved)
+    asked = [str(night_dataset), str(tmp_path / "local.mcap"), "--out", str(tmp_path / "x.mcap")]
+    refused = CliRunner().invoke(app, ["overlay", *asked])
+    assert "give --assume" in refused.output + str(refused.exception)
+    ended = CliRunner().invoke(app, ["overlay", *asked, "--assume", "*.ahead_s=75600", "--json"])
+    assert ended.exit_code == 0, ended.output
+    told = json.loads(ended.stdout)
+    assert (told["frames"], told["without_rows"]) == (240, 0)
+
+
 def test_a_log_is_not_replaced_by_its_overlay(night_log, night_dataset, tmp_path):
     log = tmp_path / "a.mcap"
     shutil.copy(night_log, log)
