@@ -10,7 +10,11 @@ from epipole.tasks.algorithms.constants import (
     GM_KM3_S2,
 )
 from epipole.tasks.algorithms.orbits.forces import Surroundings
-from epipole.tasks.algorithms.orbits.trajectories import propagate_unknowns
+from epipole.tasks.algorithms.orbits.trajectories import (
+    integrate,
+    positions_at,
+    propagate_unknowns,
+)
 
 # Steps of the numerical derivatives: a share of the position and of the velocity, at which
 # rounding and curvature are both below 1e-6 of the derivative.
@@ -22,6 +26,8 @@ REGION_KM = 200.0
 REGION_RAD = np.radians(15.0)
 SIGMAS = 3.0  # by which a semi-major axis may be outside the region
 SIDEREAL_DAY_S = TURN / EARTH_RATE_RAD_S
+# Instants of a sidereal day at which turns are counted: between two of them no orbit turns by half.
+INSTANTS = 200
 
 
 IN_DEGREES = np.array([1.0, 1.0, *np.degrees(np.ones(4))])  # elements times this: angles in degrees
@@ -119,7 +125,8 @@ def geostationary(
     Notes
     -----
     The drift is the change of longitude over a sidereal day around the epoch, in which the daily
-    motion of an eccentric or inclined orbit cancels.
+    motion of an eccentric or inclined orbit cancels. Whole turns count: an object that moves west
+    makes two of them.
     """
     state = unknowns[:6]
     a_km, sigma_km = elements_of(state)[0], element_errors(state[None], cov[None, :6, :6])[0, 0]
@@ -138,7 +145,10 @@ def geostationary(
         end, of_end = _longitude(there, to_s, around)
         ends.append(end)
         slopes.append(of_end @ transition)
-    drift = ((ends[1] - ends[0] + np.pi) % TURN - np.pi) / SIDEREAL_DAY_S
+    change = (ends[1] - ends[0] + np.pi) % TURN - np.pi
+    turns = (_change_of_longitude(unknowns, epoch_s, around) - change) / TURN
+    change += TURN * float(np.round(turns))
+    drift = change / SIDEREAL_DAY_S
     of_drift = (slopes[1] - slopes[0]) / SIDEREAL_DAY_S
     return Geostationary(
         longitude,
@@ -146,6 +156,15 @@ def geostationary(
         float(drift),
         float(np.sqrt(of_drift @ cov @ of_drift)),
     )
+
+
+def _change_of_longitude(unknowns: Array, epoch_s: float, around: Surroundings) -> float:
+    """Return by how much the longitude grows in the sidereal day around the epoch [rad]."""
+    at_s = epoch_s + SIDEREAL_DAY_S * np.linspace(-0.5, 0.5, INSTANTS)
+    path = integrate(unknowns, epoch_s, float(at_s[0]), float(at_s[-1]), around)
+    r_km = positions_at(path, at_s)
+    turned = np.unwrap(np.arctan2(r_km[:, 1], r_km[:, 0]))
+    return float(turned[-1] - turned[0]) - TURN
 
 
 def _longitude(unknowns: Array, time_s: float, around: Surroundings) -> tuple[float, Array]:

@@ -99,6 +99,26 @@ def test_the_error_of_the_drift_is_that_of_many_orbits():
     assert np.std(drifts) == pytest.approx(found.sigma_drift_rad_s, rel=0.12)
 
 
+def test_an_object_that_moves_west_drifts_by_two_turns_a_day():
+    state = fixed_on_the_earth(1.2)
+    state[3:6] *= -1
+    found = geostationary(state, cov_of(COV), 0.0, AROUND)
+    per_sidereal_day = np.degrees(found.drift_rad_s) * 86164.1
+    assert per_sidereal_day == pytest.approx(-720.0, abs=0.1)
+
+
+def test_the_drift_of_a_vague_orbit_counts_whole_turns():
+    # At apogee, with a revolution in 0.53 days: the object gains 0.89 turns in a day.
+    state = fixed_on_the_earth(1.2)
+    state[3:6] *= 0.69
+    wide = cov_of(np.diag([100.0, 100, 100, 1, 1, 1]) ** 2)
+    found = geostationary(state, wide, 0.0, AROUND)
+    a_km = elements_of(state[:6])[0]
+    turns = 86164.1 / (2 * np.pi * np.sqrt(a_km**3 / 398600.4418)) - 1
+    assert turns > 0.8
+    assert np.degrees(found.drift_rad_s) * 86164.1 / 360 == pytest.approx(turns, abs=0.1)
+
+
 def test_other_orbits_have_no_longitude():
     assert geostationary(LOW, cov_of(COV), 0.0, AROUND) is None
     assert geostationary(GEO * [1, 1, 1, 1.2, 1.2, 1.2, 1, 1], cov_of(COV), 0.0, AROUND) is None
