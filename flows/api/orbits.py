@@ -133,7 +133,8 @@ def attributable(
     Raises
     ------
     ValueError
-        Where arrays differ in length, are empty, or times are not in order.
+        Where arrays differ in length, are empty or have NaN, times are not in order, or a sigma
+        is not above 0.
 
     References
     ----------
@@ -165,6 +166,10 @@ def attributable(
         for name, values in (("ra_deg", ra_deg), ("dec_deg", dec_deg))
     )
     sigma = ARCSEC * floats("sigma_arcsec", sigma_arcsec, n, repeat=True)
+    if not np.isfinite([ra, dec]).all():
+        raise ValueError("ra_deg, dec_deg: have values that are no numbers; leave them out")
+    if not (np.isfinite(sigma) & (sigma > 0.0)).all():
+        raise ValueError("sigma_arcsec: has values that are not above 0, or no numbers")
     epoch_ns = (int(at_ns[0]) + int(at_ns[-1])) // 2 if at is None else time_ns(at)
     u = unit_from_radec(ra, dec)
     fit = attributables(

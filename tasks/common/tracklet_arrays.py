@@ -17,10 +17,14 @@ HAS_ATTRIBUTABLE = pl.all_horizontal(
 
 
 def known_numbers(rows: pl.DataFrame) -> pl.Series:
-    """Return a number for each tracklet, from 0: one for those of an object, or of a track."""
+    """Return a number for each tracklet, from 0: one for those of an object, or of a track.
+
+    -1 for a tracklet of neither.
+    """
     # An object's id has no slash.
     name = pl.coalesce("object_id", pl.format("{}/{}", "sensor_id", "track_id"))
-    return rows.select(known=name.rank("dense").cast(pl.Int64) - 1).to_series()
+    number = name.rank("dense").cast(pl.Int64) - 1
+    return rows.select(known=number.fill_null(-1)).to_series()
 
 
 def attributables_of(rows: pl.DataFrame) -> Tracklets:

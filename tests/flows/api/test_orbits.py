@@ -49,6 +49,10 @@ def test_the_epoch_can_be_chosen_and_errors_given_one_by_one():
         ({"time": TIME[:0]}, "no times"),
         ({"time": np.append(TIME[:-1], np.datetime64("NaT"))}, "or NaT"),
         ({"ra_deg": [1.0]}, r"ra_deg: has shape \(1,\), expected \(20,\)"),
+        ({"dec_deg": np.append(np.ones(19), np.nan)}, "no numbers; leave them out"),
+        ({"sigma_arcsec": 0.0}, "not above 0"),
+        ({"sigma_arcsec": -3.0}, "not above 0"),
+        ({"sigma_arcsec": np.append(np.ones(19), np.nan)}, "not above 0, or no numbers"),
     ],
 )
 def test_a_passage_that_cannot_be_used_is_an_error(other, says):
@@ -175,6 +179,15 @@ def test_known_objects_are_kept_and_links_can_be_refused():
     assert alone.to_list() == list(range(24))
     known = rows.with_columns(object_id=pl.Series([f"o{k}" for k in scene.object]))
     assert api.link(known, NEVER).equals(api.link(known))
+
+
+@pytest.mark.filterwarnings("error")
+def test_tracklets_of_no_track_are_each_by_itself_before():
+    scene = orbit_tracklets(11, 6, 4, 60.0)
+    rows = pl.DataFrame(rows_of(scene)).with_columns(
+        track_id=pl.when(pl.int_range(24) % 2 == 0).then("track_id")
+    )
+    assert api.link(rows, NEVER).to_list() == list(range(24))
 
 
 def test_a_table_that_is_not_of_tracklets_is_an_error():
