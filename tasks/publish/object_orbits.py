@@ -16,6 +16,7 @@ from epipole.tasks.algorithms.constants import (
     SECOND_NS,
 )
 from epipole.tasks.algorithms.geometry.directions import east_north, unit_from_radec
+from epipole.tasks.algorithms.orbit_linking.population import log_density
 from epipole.tasks.algorithms.orbits.forces import Surroundings
 from epipole.tasks.algorithms.orbits.initial_orbit import initial_orbit
 from epipole.tasks.algorithms.orbits.orbit_determination import (
@@ -200,7 +201,7 @@ def best_orbit(
     if start is not None:
         state = turned(state_rotation(around.R_night_from_gcrf), start.state)
         found = _from_state(directions, state, (start.time_ns - origin_ns) / SECOND_NS, around)
-    if found is None and (initial := initial_orbit(directions, around)) is not None:
+    if found is None and (initial := initial_orbit(directions, around, log_density)) is not None:
         found = _from_state(directions, *initial, around)
     return found
 

@@ -4,7 +4,14 @@ Over some minutes the path is nearly a parabola, and then the directions of seve
 linear equations of its position and velocity. Where these do not decide, as with one satellite:
 two directions leave two unknowns, the distance and how fast it changes. All pairs of these are
 tried; each gives an orbit, which is compared with the directions between.
+
+Directions of one satellite over less than a minute or two fit many orbits, among them any that
+are near the satellite's: at a small distance nothing moves. They are the worst: the nearer, the
+smaller all errors. So orbits are compared by evidence, which counts how many objects there may be
+about each of them.
 """
+
+from collections.abc import Callable
 
 import numpy as np
 
@@ -14,9 +21,14 @@ from epipole.tasks.algorithms.earth_gravity import LOWEST_ORBIT_KM, gravity, pro
 from epipole.tasks.algorithms.orbits.forces import Surroundings
 from epipole.tasks.algorithms.orbits.orbit_determination import (
     AreaPrior,
+    DeterminedOrbit,
     ObjectDirections,
     determine_orbit,
+    velocity_prior,
 )
+
+# Returns the log of the density of objects about states (n, 6), up to a constant: (n,).
+LogDensity = Callable[[Array], Array]
 
 LONGEST_S = 600.0  # between the two directions: beyond it one pair of distances has many orbits
 DISTANCES_KM = np.geomspace(50.0, 60_000.0, 48)  # 16 % apart, which the fit converges from
@@ -24,13 +36,15 @@ RATES_KM_S = np.linspace(-15.0, 15.0, 41)  # of the distance: two low satellites
 COMPARED, FITTED = 16, 100  # directions of these minutes, at most
 REFINED = 6  # of the best orbits, which are fitted
 STEP_S = 60.0  # longest step of the propagation: right to some metres in ten minutes
-FITS = 1.5  # chi-square over its degrees of freedom: no other orbit is tried
+BETTER = 0.01  # in log evidence: with less, two fits found the same orbit
 ROUNDS = 6  # of the linear equations, each with the gravity of the path before
 SHOTS = 3  # of the velocity; each leaves a hundredth of the miss
 GRAVITY_ALONE = AreaPrior(np.zeros(2), np.zeros(2))
 
 
-def initial_orbit(directions: ObjectDirections, around: Surroundings) -> tuple[Array, float] | None:
+def initial_orbit(
+    directions: ObjectDirections, around: Surroundings, log_density: LogDensity
+) -> tuple[Array, float] | None:
     """Return a state (6,) [km, km/s] and its time [s] by some minutes of the directions.
 
     None if no bound orbit fits. Axes and times are those of the directions.
@@ -44,27 +58,56 @@ def initial_orbit(directions: ObjectDirections, around: Surroundings) -> tuple[A
     first, last = _widest_pair(directions)
     if first == last:
         return None
-    chosen = np.unique(np.linspace(first, last, COMPARED).round().astype(np.int64))
-    time_s, _, r_km, u, *_ = directions
-    span_s = float(time_s[last] - time_s[first])
-    rho, rate = (a.ravel()[:, None] for a in np.meshgrid(DISTANCES_KM, RATES_KM_S, indexing="ij"))
-    near = r_km[first] + rho * u[first]
-    far = r_km[last] + np.maximum(rho + rate * span_s, DISTANCES_KM[0]) * u[last]
-    states = _orbits_through(near, far, span_s)
-    misfit = _misfit(states, directions, chosen)
     part = _rows(directions, np.unique(np.linspace(first, last, FITTED).round().astype(np.int64)))
-    order = np.argsort(misfit, kind="stable")[:REFINED]
-    tried = [_along_parabola(part), *states[order[np.isfinite(misfit[order])]]]
-    at_s, dof = float(time_s[first]), 2 * len(part.time_s) - 6
+    tried = [_along_parabola(part), *_likeliest(directions, first, last, log_density)]
+    at_s = float(directions.time_s[first])
     best: tuple[float, Array] | None = None
     for state in tried:
         orbit = determine_orbit(part, state, at_s, at_s, GRAVITY_ALONE, around)
         above = float(np.linalg.norm(orbit.unknowns[:3])) > LOWEST_ORBIT_KM  # false of NaN
-        if above and (best is None or orbit.chi2 < best[0]):
-            best = orbit.chi2, orbit.unknowns[:6]
-        if best is not None and best[0] < FITS * dof:
-            break
+        if not above:
+            continue
+        evidence = _log_evidence(orbit, log_density)
+        if best is None or evidence > best[0] + BETTER:
+            best = evidence, orbit.unknowns[:6]
     return None if best is None else (best[1], at_s)
+
+
+def _log_evidence(orbit: DeterminedOrbit, log_density: LogDensity) -> float:
+    """Return the log of how probable the directions are for objects about an orbit (Laplace)."""
+    state, cov = orbit.unknowns[:6], orbit.cov[:6, :6]
+    pulls, _ = velocity_prior(state)
+    of_directions = orbit.chi2 - float(pulls @ pulls)
+    # Scaled: the unknowns are km and km/s.
+    sigma = np.sqrt(np.diag(cov))
+    _, log_det = np.linalg.slogdet(cov / sigma[:, None] / sigma)
+    volume = float(np.sum(np.log(sigma))) + log_det / 2
+    return float(log_density(state[None])[0]) + volume - of_directions / 2
+
+
+def _likeliest(
+    directions: ObjectDirections, first: int, last: int, log_density: LogDensity
+) -> Array:
+    """Return states (k, 6) at the first of two directions: the likeliest distances of the grid,
+    each with its likeliest rate."""
+    time_s, _, r_km, u, *_ = directions
+    chosen = np.unique(np.linspace(first, last, COMPARED).round().astype(np.int64))
+    span_s = float(time_s[last] - time_s[first])
+    rho, rate = (a.ravel()[:, None] for a in np.meshgrid(DISTANCES_KM, RATES_KM_S, indexing="ij"))
+    then = np.maximum(rho + rate * span_s, DISTANCES_KM[0])
+    states = _orbits_through(r_km[first] + rho * u[first], r_km[last] + then * u[last], span_s)
+    # The directions between those that are compared tell as much.
+    chi2 = _chi2(states, directions, chosen) * (last - first + 1) / len(chosen)
+    # The errors of both directions fill a volume that grows with the squares of both distances; the
+    # steps of the grid are even in the log of the first.
+    volume = 3.0 * np.log(rho[:, 0]) + 2.0 * np.log(then[:, 0])
+    with np.errstate(all="ignore"):
+        score = log_density(states) + volume - chi2 / 2
+    score = np.where(np.isfinite(score), score, -np.inf).reshape(len(DISTANCES_KM), -1)
+    order = np.argsort(-score.max(axis=1), kind="stable")[:REFINED]
+    order = order[np.isfinite(score.max(axis=1)[order])]
+    rates = np.argmax(score[order], axis=1)
+    return np.asarray(states.reshape(*score.shape, 6)[order, rates])
 
 
 def _along_parabola(part: ObjectDirections) -> Array:
@@ -136,8 +179,9 @@ def _moved(states: Array, dt_s: float) -> Array:
     return np.hstack(propagate_states(states[:, :3], states[:, 3:], np.array([dt_s]), steps))
 
 
-def _misfit(states: Array, directions: ObjectDirections, chosen: Indices) -> Array:
-    """Return the sum of squared angles [rad^2] between states and directions; infinite if NaN."""
+def _chi2(states: Array, directions: ObjectDirections, chosen: Indices) -> Array:
+    """Return chi-square of states and directions, by independent errors; infinite where NaN, or
+    where the object is behind the sensor."""
     total = np.full(len(states), np.inf)
     rows = np.flatnonzero(np.isfinite(states[:, 0]))
     y, now = states[rows], directions.time_s[chosen[0]]
@@ -147,6 +191,8 @@ def _misfit(states: Array, directions: ObjectDirections, chosen: Indices) -> Arr
             y, now = _moved(y, float(directions.time_s[k] - now)), directions.time_s[k]
             line = y[:, :3] - directions.r_km[k]
             line /= np.linalg.norm(line, axis=1, keepdims=True)
-            squares += np.sum((line - directions.u[k]) ** 2, axis=1)
+            off = line @ directions.basis[k].T
+            squares += np.einsum("ni,ij,nj->n", off, directions.weight[k], off)
+            squares[~(line @ directions.u[k] > 0.0)] = np.inf
     total[rows] = np.where(np.isfinite(squares), squares, np.inf)
     return total

@@ -249,7 +249,7 @@ def _at(
     path = integrate(unknowns, epoch_s, first, last, around)
     _sum_up(path, directions, used, shared, sums, of_directions)
     off = (unknowns[6:] - areas.mean) / np.where(areas.sigma > 0.0, areas.sigma, 1.0)
-    pulls, _ = _velocity_prior(unknowns[:6])
+    pulls, _ = velocity_prior(unknowns[:6])
     of_priors = float(off @ off) + float(pulls @ pulls)
     of_priors += float(np.einsum("si,sij,sj->", shared, directions.prior, shared))
     chi2 = float(of_directions[used].sum()) + of_priors
@@ -288,13 +288,13 @@ def _with_priors(point: _Point, areas: AreaPrior) -> tuple[Array, Array]:
     information = np.diag(np.append(np.zeros(6), of_areas))
     right = point.sums.of_orbit.copy()
     right[6:] -= of_areas * (point.unknowns[6:] - areas.mean)
-    pulls, slopes = _velocity_prior(point.unknowns[:6])
+    pulls, slopes = velocity_prior(point.unknowns[:6])
     information[:6, :6] = slopes.T @ slopes
     right[:6] -= slopes.T @ pulls
     return information, right
 
 
-def _velocity_prior(state: Array) -> tuple[Array, Array]:
+def velocity_prior(state: Array) -> tuple[Array, Array]:
     """Return how far a velocity is from a circular orbit's, (2,), with the derivatives, (2, 6).
 
     Radially and horizontally, over `VELOCITY_SIGMA` of the circular orbit's speed.

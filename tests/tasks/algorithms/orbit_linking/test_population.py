@@ -10,6 +10,7 @@ from epipole.tasks.algorithms.orbit_linking.population import (
     N_OBJECTS,
     SIGMA,
     log_attributable_density,
+    log_density,
     log_height_density,
     prior_of,
 )
@@ -24,6 +25,14 @@ def density(x):
         log = prior_of(x, component, pulls)
         total += np.exp(log - pulls @ pulls / 2)
     return total
+
+
+def test_the_density_of_many_states_is_that_of_each():
+    rng = np.random.default_rng(4)
+    states = np.hstack([rng.normal(size=(200, 3)) * 9000.0, rng.normal(size=(200, 3)) * 5.0])
+    expected = [density(x) for x in states]
+    np.testing.assert_allclose(np.exp(log_density(states)), expected, rtol=1e-9)
+    assert 0 < np.sum(np.array(expected) == 0.0) < 100  # those in the ground
 
 
 def test_heights_add_up_to_all_objects():

@@ -137,9 +137,9 @@ def test_an_orbit_that_the_directions_leave_open_is_closed(monkeypatch):
 
 def test_the_derivatives_of_the_prior_are_right():
     state, size = LOW[:6] * [1.0, 1.1, 0.9, 1.2, 0.8, 1.0], np.array([0.1] * 3 + [1e-4] * 3)
-    _, slopes = determination._velocity_prior(state)
+    _, slopes = determination.velocity_prior(state)
     for k, h in enumerate(np.diag(size)):
-        after, before = (determination._velocity_prior(state + sign * h)[0] for sign in (1, -1))
+        after, before = (determination.velocity_prior(state + sign * h)[0] for sign in (1, -1))
         np.testing.assert_allclose(slopes[:, k], (after - before) / (2 * size[k]), rtol=1e-6)
 
 
