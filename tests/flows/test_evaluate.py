@@ -8,6 +8,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 
 import numpy as np
+import polars as pl
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
@@ -169,6 +170,23 @@ def test_what_is_not_there_is_said(night_log, tmp_path):
     (tmp_path / "x.truth").mkdir()
     with pytest.raises(DatasetError, match=r"frames.parquet, .* missing; give the folder"):
         evaluate(tmp_path, tmp_path / "x")
+
+
+def test_nights_that_the_dataset_lacks_are_not_held_against_it(
+    night_log, night_dataset, tmp_path, caplog
+):
+    folder = shutil.copytree(f"{night_log}.truth", tmp_path / "two.truth")
+    for name in ("frames", "points"):
+        path = folder / f"{name}.parquet"
+        rows = pl.read_parquet(path)
+        later = rows.with_columns(pl.col("frame_number") + 100_000)
+        if name == "frames":
+            later = later.with_columns(pl.col("t_ns") + 86_400 * 10**9)
+        pl.concat([rows, later]).write_parquet(path)
+    assert evaluate(night_dataset, folder) == evaluate(night_dataset, night_log)
+    assert [record.message for record in caplog.records] == [
+        f"{night_dataset}: has no 2019-04-02: not evaluated"
+    ]
 
 
 @pytest.mark.long
