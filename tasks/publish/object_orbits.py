@@ -18,7 +18,7 @@ from epipole.tasks.algorithms.constants import (
 from epipole.tasks.algorithms.geometry.directions import east_north, unit_from_radec
 from epipole.tasks.algorithms.orbit_linking.population import log_density
 from epipole.tasks.algorithms.orbits.forces import Surroundings
-from epipole.tasks.algorithms.orbits.initial_orbit import initial_orbit
+from epipole.tasks.algorithms.orbits.initial_orbit import LONGER_S, LONGEST_S, initial_orbit
 from epipole.tasks.algorithms.orbits.orbit_determination import (
     AreaPrior,
     DeterminedOrbit,
@@ -201,9 +201,23 @@ def best_orbit(
     if start is not None:
         state = turned(state_rotation(around.R_night_from_gcrf), start.state)
         found = _from_state(directions, state, (start.time_ns - origin_ns) / SECOND_NS, around)
-    if found is None and (initial := initial_orbit(directions, around, log_density)) is not None:
-        found = _from_state(directions, *initial, around)
-    return found
+    return _without_start(directions, around) if found is None else found
+
+
+def _without_start(directions: ObjectDirections, around: Surroundings) -> FittedOrbit | None:
+    """Return the orbit by an initial state from the directions: of minutes, else of more of them.
+
+    Of two that do not fit the first.
+    """
+    arc_s = float(directions.time_s[-1] - directions.time_s[0])
+    first: FittedOrbit | None = None
+    for longest_s in (LONGEST_S, LONGER_S) if arc_s > LONGEST_S else (LONGEST_S,):
+        initial = initial_orbit(directions, around, log_density, longest_s)
+        found = None if initial is None else _from_state(directions, *initial, around)
+        if judge(found) is None:
+            return found
+        first = first or found
+    return first
 
 
 def _from_state(

@@ -30,7 +30,9 @@ from epipole.tasks.algorithms.orbits.orbit_determination import (
 # Returns the log of the density of objects about states (n, 6), up to a constant: (n,).
 LogDensity = Callable[[Array], Array]
 
-LONGEST_S = 600.0  # between the two directions: beyond it one pair of distances has many orbits
+# Longest time between the two directions. With the longer one more pairs of distances lead to no
+# orbit; but two passages of seconds, a quarter of an hour apart, show little each.
+LONGEST_S, LONGER_S = 600.0, 1500.0
 DISTANCES_KM = np.geomspace(50.0, 60_000.0, 48)  # 16 % apart, which the fit converges from
 RATES_KM_S = np.linspace(-15.0, 15.0, 41)  # of the distance: two low satellites that meet
 COMPARED, FITTED = 16, 100  # directions of these minutes, at most
@@ -43,11 +45,15 @@ GRAVITY_ALONE = AreaPrior(np.zeros(2), np.zeros(2))
 
 
 def initial_orbit(
-    directions: ObjectDirections, around: Surroundings, log_density: LogDensity
+    directions: ObjectDirections,
+    around: Surroundings,
+    log_density: LogDensity,
+    longest_s: float = LONGEST_S,
 ) -> tuple[Array, float] | None:
     """Return a state (6,) [km, km/s] and its time [s] by some minutes of the directions.
 
-    None if no bound orbit fits. Axes and times are those of the directions.
+    At most `longest_s` of them. None if no bound orbit fits. Axes and times are those of the
+    directions.
 
     References
     ----------
@@ -55,7 +61,7 @@ def initial_orbit(
     determination from three lines of sight, CMDA 66:387, improves two distances from a guess. Here
     they are searched over a grid, so that no orbit is missed.
     """
-    first, last = _widest_pair(directions)
+    first, last = _widest_pair(directions, longest_s)
     if first == last:
         return None
     part = _rows(directions, np.unique(np.linspace(first, last, FITTED).round().astype(np.int64)))
@@ -132,11 +138,11 @@ def _along_parabola(part: ObjectDirections) -> Array:
     return state
 
 
-def _widest_pair(directions: ObjectDirections) -> tuple[int, int]:
-    """Return the first and last direction of the stretch, at most `LONGEST_S`, that most sensors
+def _widest_pair(directions: ObjectDirections, longest_s: float) -> tuple[int, int]:
+    """Return the first and last direction of the stretch, at most `longest_s`, that most sensors
     saw, and of these the longest."""
     time_s, sensor = directions.time_s, directions.sensor
-    ends = np.searchsorted(time_s, time_s + LONGEST_S, side="right") - 1
+    ends = np.searchsorted(time_s, time_s + longest_s, side="right") - 1
     begins = np.flatnonzero(np.diff(ends, prepend=-1) > 0)
     best = max(
         begins.tolist(),

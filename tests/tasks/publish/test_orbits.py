@@ -417,3 +417,18 @@ def test_a_million_directions_may_have_sigmas_that_are_right_to_a_per_cent(n, sq
         no_equations(1),
     )  # fmt: skip
     assert judge(FittedOrbit(orbit, 0.0, "")) == reason
+
+
+@pytest.mark.parametrize("gap_s", [700.0, 1200.0])
+def test_two_passages_a_quarter_of_an_hour_apart_have_an_orbit_without_a_start(gap_s):
+    times_s = np.concatenate([side * gap_s / 2 + np.linspace(-5, 5, 9) for side in (-1, 1)])
+    squares = []
+    for seed in range(16):
+        seen = trial(seed, LOW, times_s=times_s, n_sensors=2)
+        rows = np.flatnonzero(seen.sensor == (seen.time_s > 0))
+        passages = type(seen)(*(a[rows] for a in seen[:-1]), seen.prior)
+        found = best_orbit(passages, None, NOON_NS, AROUND)
+        assert judge(found) is None
+        off = (found.orbit.unknowns - LOW)[:6]
+        squares.append(off @ np.linalg.solve(found.orbit.cov[:6, :6], off))
+    assert max(squares) < 22.5  # 1 in 1,000 is above
