@@ -329,7 +329,7 @@ class Reason(StrEnum):
     NO_POSITION = (
         "no_position",
         Stage.SOLVE,
-        "The views of the object have no common point.",
+        "The views of the object have no common point, or are parallel within their errors.",
         Trait.SUMMED,
     )
     STATE_MISFIT = (

@@ -75,8 +75,8 @@ class Positions(NamedTuple):
     Attributes
     ----------
     r_gcrf_km : (g, 3) float
-        Positions [km], GCRF; NaN where fewer than two lines are left, or they are parallel or
-        meet behind a sensor.
+        Positions [km], GCRF; NaN where fewer than two lines are left, or they are parallel within
+        their errors or meet behind a sensor.
     cov_km2 : (g, 3, 3) float
         Their covariances.
     chi2 : (g,) float

@@ -16,6 +16,10 @@ from epipole.tasks.algorithms.symmetric_matrices import invert_symmetric
 
 ITERATIONS = 12
 CONVERGED = 1e-9  # of the range
+# Largest error of a position, over its range: with a larger one the lines are parallel within their
+# errors. Two cameras of one satellite leave any range, and the covariance at the wrong one is too
+# small: of such positions 50 % lie in their 99 % ellipsoid, and of those at this limit 95 %.
+MAX_ERROR = 0.2
 LIGHT = SPEED_OF_LIGHT_KM_S
 
 
@@ -42,7 +46,7 @@ class Triangulated(NamedTuple):
 
     r_km : (g, 3) float
         Positions [km] at the epoch minus the mean light time of the used views; NaN if the lines
-        are parallel or meet behind a sensor, or with fewer than two views.
+        are parallel within their errors or meet behind a sensor, or with fewer than two views.
     cov_km2 : (g, 3, 3) float
         Covariances of the positions.
     chi2 : (g,) float
@@ -238,14 +242,17 @@ def _solve_groups(offsets, lines, velocity, reject2, out):
             if score <= reject2:
                 break
             use = use[use != v]
-        for v in range(lo, hi):
-            used[v] = False
         mean_range[g] = 0.0
         for v in use:
-            used[v] = not np.isnan(chi2[g])
             mean_range[g] += np.sqrt(
                 (x[g, 0] - r[v, 0]) ** 2 + (x[g, 1] - r[v, 1]) ** 2 + (x[g, 2] - r[v, 2]) ** 2
             ) / len(use)
+        if not P[g, 0, 0] + P[g, 1, 1] + P[g, 2, 2] < (MAX_ERROR * mean_range[g]) ** 2:
+            chi2[g] = np.nan  # parallel within their errors
+        for v in range(lo, hi):
+            used[v] = False
+        for v in use:
+            used[v] = not np.isnan(chi2[g])
 
 
 def triangulate(

@@ -134,6 +134,24 @@ def test_views_that_are_parallel_without_a_wrong_one_have_no_position():
     assert not used.any()
 
 
+@pytest.mark.parametrize(("baseline_km", "share"), [(0.01, 0.0), (0.1, 0.5), (1.0, 1.0)])
+def test_lines_that_are_parallel_within_their_errors_have_no_position(baseline_km, share):
+    """Two cameras of one satellite: where their lines meet is chance."""
+    rng, trials, sigma = np.random.default_rng(7), 1000, 2 * ARCSEC
+    r = np.tile([[7000.0, 0.0, 0.0], [7000.0, baseline_km, 0.0]], (trials, 1))
+    x_km = np.array([8500.0, 0.0, 0.0])
+    u = look(r, x_km, rng, sigma)
+    x, cov, chi2, used, *_ = solve(r, u, sigma, offsets=np.arange(trials + 1) * 2)
+    has = np.isfinite(chi2)
+    assert abs(has.mean() - share) < 0.05
+    np.testing.assert_array_equal(used, np.repeat(has, 2))
+    assert np.isnan(x[~has]).all()
+    if share:
+        off = x[has] - x_km
+        nees = np.einsum("ni,nij,nj->n", off, np.linalg.inv(cov[has]), off)
+        assert np.mean(nees < 11.345) > 0.85
+
+
 def test_nothing_in_gives_nothing_out():
     x, cov, chi2, used, mean_range, *_ = solve(
         np.zeros((0, 3)), np.zeros((0, 3)), ARCSEC, offsets=np.zeros(1, int)
