@@ -31,10 +31,11 @@ def solve_positions(
 ) -> ViewGroups:
     """Return the positions, with covariances, of objects that two or more sensors detect.
 
-    They are solved twice. The first solution gives the velocities: by its positions, or by the
-    rates of the directions where there is a single one. The second solution needs them because the
-    light times to the sensors differ, and because the fits of the directions neglected a part of
-    the motion.
+    They are solved three times. Each solution gives the velocities: by its positions, or by the
+    rates of the directions where there is a single one. The next one needs them because the light
+    times to the sensors differ, and the last one also because the fits of the directions neglected
+    a part of the motion. The first one rejects no view: without velocities, light times put right
+    ones 30 sigma off.
 
     Parameters
     ----------
@@ -58,15 +59,16 @@ def _solve(views: ObjectViews, reject_sigma: float) -> ViewGroups:
     epoch_ns, number = views.epoch_ns[start], views.object_number[start]
     group = np.repeat(np.arange(len(start)), np.diff(offsets))
     velocity = np.zeros((len(start), 3))
-    for last in (False, True):
+    for step in range(3):
+        limit = reject_sigma if step else np.inf
         x_km, cov_km2, chi2, used, mean_range = triangulate(
-            offsets, views.r_km, views.u, views.cov, views.sigma_km, velocity, reject_sigma
+            offsets, views.r_km, views.u, views.cov, views.sigma_km, velocity, limit
         )
         velocity, spread_s = _velocities(epoch_ns, number, x_km)
         alone = (spread_s == 0.0) & np.isfinite(chi2)
         if alone.any():
             velocity[alone] = _velocities_by_rates(views, group, alone, x_km, used)
-        if not last:
+        if step == 1:
             sigma = np.sqrt(traces(cov_km2) / 3)
             state = np.hstack([x_km, velocity])[group]
             views = with_neglected_motion(views, state, sigma[group], spread_s[group])

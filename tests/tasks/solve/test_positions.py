@@ -92,6 +92,35 @@ def test_independent_positions_of_neighbouring_spans_share_no_detection():
     assert len(used) == 9  # five, and from 60 s on four
 
 
+def tracked(rng, name, sensor, target, spread_arcsec, at, t):
+    """Views of an object, a state at time 0, by a sensor, another one: fitted at the times `at` to
+    noisy detections at the times t [s]."""
+    r_km, delay_s = trajectory(sensor, t)[0][:, :3], 0.0
+    for _ in range(3):
+        u = trajectory(target, t - delay_s)[0][:, :3] - r_km
+        delay_s = np.linalg.norm(u, axis=1) / SPEED_OF_LIGHT_KM_S
+    u /= np.linalg.norm(u, axis=1, keepdims=True)
+    noise = centroid_covariance(u, np.full(len(u), spread_arcsec * ARCSEC))
+    u = u + np.einsum("ni,nij->nj", rng.normal(size=(len(u), 2)), tangent_basis(u)) * (
+        spread_arcsec * ARCSEC
+    )
+    u /= np.linalg.norm(u, axis=1, keepdims=True)
+    ends = np.zeros(len(at), int), np.full(len(at), len(t))
+    fit = directions_at(*ends, at, 0.01, t, u, noise, 0 * noise, 6.0)
+    here = trajectory(sensor, at)[0]
+    cov = on_tangent_plane(fit.u, fit.cov_noise)
+    epoch = T0 + np.round(at * 1e9).astype(np.int64)
+    return filled(VIEWS, len(at), {
+        "epoch": epoch, "sensor_id": [name] * len(at), "tracklet_id": [name] * len(at),
+        "first_fitted": epoch, "last_fitted": epoch, "unmodelled_rad2": fit.unmodelled,
+        "blend_rad2": np.zeros(len(epoch)),
+        **unstack("u{}", fit.u), **unstack("moment_{}", fit.moments, "123"),
+        **unstack_covariance("cov_noise_{}_rad2", cov, TANGENT_AXES),
+        **unstack("{}_km", here[:, :3]), **unstack("sensor_v{}_km_s", here[:, 3:]),
+        "position_sigma_km": np.full(len(at), 1e-4), "pixel_rad": np.full(len(at), 1e-4),
+    })  # fmt: skip
+
+
 def turning(seed, spread_arcsec):
     """Views of a geostationary object from three low sensors, fitted to 13 noisy detections each.
 
@@ -106,30 +135,7 @@ def turning(seed, spread_arcsec):
         side = np.array([0.6 * np.sin(angle), -np.sin(angle), np.cos(angle)])
         side /= np.linalg.norm(side)
         sensor = np.concatenate([7000 * side, 7.5 * np.cross(side, [0.8, 0.6, 0.0])])
-        r_km, delay_s = trajectory(sensor, t)[0][:, :3], 0.0
-        for _ in range(3):
-            u = trajectory(target, t - delay_s)[0][:, :3] - r_km
-            delay_s = np.linalg.norm(u, axis=1) / SPEED_OF_LIGHT_KM_S
-        u /= np.linalg.norm(u, axis=1, keepdims=True)
-        noise = centroid_covariance(u, np.full(len(u), spread_arcsec * ARCSEC))
-        u = u + np.einsum("ni,nij->nj", rng.normal(size=(len(u), 2)), tangent_basis(u)) * (
-            spread_arcsec * ARCSEC
-        )
-        u /= np.linalg.norm(u, axis=1, keepdims=True)
-        ends = np.zeros(len(at), int), np.full(len(at), len(t))
-        fit = directions_at(*ends, at, 0.01, t, u, noise, 0 * noise, 6.0)
-        here = trajectory(sensor, at)[0]
-        cov = on_tangent_plane(fit.u, fit.cov_noise)
-        epoch = T0 + np.round(at * 1e9).astype(np.int64)
-        tables.append(filled(VIEWS, len(at), {
-            "epoch": epoch, "sensor_id": [f"s{k}"] * len(at), "tracklet_id": [f"s{k}"] * len(at),
-            "first_fitted": epoch, "last_fitted": epoch, "unmodelled_rad2": fit.unmodelled,
-            "blend_rad2": np.zeros(len(epoch)),
-            **unstack("u{}", fit.u), **unstack("moment_{}", fit.moments, "123"),
-            **unstack_covariance("cov_noise_{}_rad2", cov, TANGENT_AXES),
-            **unstack("{}_km", here[:, :3]), **unstack("sensor_v{}_km_s", here[:, 3:]),
-            "position_sigma_km": np.full(len(at), 1e-4), "pixel_rad": np.full(len(at), 1e-4),
-        }))  # fmt: skip
+        tables.append(tracked(rng, f"s{k}", sensor, target, spread_arcsec, at, t))
     return concat(VIEWS, tables), lambda s: trajectory(target, s)[0][:, :3]
 
 
@@ -146,6 +152,45 @@ def test_what_the_fits_of_directions_neglect_does_not_add_up():
         mean_off.append(mean @ np.linalg.solve(cov.mean(axis=0) / len(off), mean) / 3)
     assert abs(np.mean(square) - 1) < 0.13
     assert abs(np.mean(mean_off) - 1) < 0.39  # three sigma of 40 trials with three axes
+
+
+PAIR_KM = 0.3  # between two low sensors
+
+
+def left_by_the_far_one(seed):
+    """Views of a low object by two low sensors side by side, and until 0 s by a geostationary one.
+
+    Its true positions are returned too.
+    """
+    rng, at, t = np.random.default_rng(seed), np.arange(-50.0, 51.0, 2.0), np.arange(-58.0, 59.0)
+    target = np.array([7800.0, 600.0, 900.0, -1.5, 6.9, 0.5])
+    low = np.array([6900.0, 0.0, 0.0, 0.0, 5.5, 5.2])
+    far = np.array([16000.0, 36000.0, 9000.0, -2.7, 1.2, 0.0])
+    beside = low + PAIR_KM * np.array([0.0, 0.6, 0.8, 0.0, 0.0, 0.0])
+    tables = [
+        tracked(rng, f"low{k}", state, target, 2.0, at, t) for k, state in enumerate((low, beside))
+    ]
+    tables.append(tracked(rng, "far", far, target, 0.3, at[at <= 0], t[t <= 0]))
+    return concat(VIEWS, tables), lambda s: trajectory(target, s)[0][:, :3]
+
+
+def squared_errors(seeds, from_s, to_s):
+    """The mean squared error over covariance of the positions between two times."""
+    square = []
+    for seed in range(seeds):
+        views, true = left_by_the_far_one(seed)
+        positions = position_table(solved(views, np.zeros(views.num_rows, int)))
+        epoch_s, at = ((array(positions, name) - T0) / 1e9 for name in ("epoch", "time"))
+        off, cov = stack(positions, "{}_km") - true(at), stack_covariance(positions, "cov_{}")
+        here = (epoch_s >= from_s) & (epoch_s <= to_s)
+        square.append(np.einsum("ni,nij,nj->n", off, np.linalg.inv(cov), off)[here])
+    return np.mean(np.concatenate(square)) / 3
+
+
+def test_positions_are_honest_before_their_velocity_is_known():
+    """Without it light times put the far sensor's line 30 sigma off. It is not rejected for that:
+    the two others alone, side by side, know the velocity badly."""
+    assert 0.8 < squared_errors(20, -50, -31) < 1.2
 
 
 def seen_once(rng, rates=True):
