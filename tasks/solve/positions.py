@@ -64,12 +64,12 @@ def _solve(views: ObjectViews, reject_sigma: float) -> ViewGroups:
         x_km, cov_km2, chi2, used, mean_range = triangulate(
             offsets, views.r_km, views.u, views.cov, views.sigma_km, velocity, limit
         )
-        velocity, spread_s = _velocities(epoch_ns, number, x_km)
+        sigma = np.sqrt(traces(cov_km2) / 3)
+        velocity, spread_s = _velocities(epoch_ns, number, x_km, sigma)
         alone = (spread_s == 0.0) & np.isfinite(chi2)
         if alone.any():
             velocity[alone] = _velocities_by_rates(views, group, alone, x_km, used)
         if step == 1:
-            sigma = np.sqrt(traces(cov_km2) / 3)
             state = np.hstack([x_km, velocity])[group]
             views = with_neglected_motion(views, state, sigma[group], spread_s[group])
     return ViewGroups(
@@ -162,14 +162,18 @@ def object_names(epoch_ns: Indices, number: Indices) -> npt.NDArray[np.object_]:
     return names
 
 
-def _velocities(epoch_ns: Indices, number: Indices, x_km: Array) -> tuple[Array, Array]:
+def _velocities(
+    epoch_ns: Indices, number: Indices, x_km: Array, sigma_km: Array
+) -> tuple[Array, Array]:
     order = np.lexsort((epoch_ns, number))
     cuts = np.flatnonzero(np.diff(number[order])) + 1
     offsets = np.concatenate([[0], cuts, [len(number)]]).astype(np.int64)
     v_km_s, spread_s = np.empty_like(x_km), np.empty(len(x_km))
     origin = epoch_ns[0] if len(epoch_ns) else 0
     time_s = (epoch_ns[order] - origin) / 1e9
-    v_km_s[order], spread_s[order] = velocities(offsets, time_s, x_km[order], VELOCITY_WINDOW_S)
+    v_km_s[order], spread_s[order] = velocities(
+        offsets, time_s, x_km[order], VELOCITY_WINDOW_S, sigma_km[order]
+    )
     return v_km_s, spread_s
 
 

@@ -44,7 +44,11 @@ def moving_objects(positions: pa.Table, every_ns: int) -> pa.Table:
     offsets = np.concatenate([[0], np.cumsum(size)]).astype(np.int64)
     time_ns = rows["epoch"].cast(pl.Int64).to_numpy()
     time_s = (time_ns - (time_ns.min() if len(time_ns) else 0)) / 1e9
-    v, _ = velocities(offsets, time_s, rows.select(POSITION).to_numpy(), VELOCITY_WINDOW_S)
+    r_km = rows.select(POSITION).to_numpy()
+    sigma_km = np.sqrt(
+        rows.select(pl.sum_horizontal("cov_xx", "cov_yy", "cov_zz")).to_numpy()[:, 0]
+    )
+    v, _ = velocities(offsets, time_s, r_km, VELOCITY_WINDOW_S, sigma_km)
     light_ns = pl.col("epoch").cast(pl.Int64) - pl.col("time").cast(pl.Int64)
     rows = rows.with_columns(
         *[pl.Series(name, v[:, k]) for k, name in enumerate(VELOCITY)], light_s=light_ns / 1e9

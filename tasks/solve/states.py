@@ -184,7 +184,8 @@ def _starts(groups: ViewGroups, named: _NamedArcs) -> Array:
     solved = named.solved
     name, epoch_ns = groups.object_id[solved], groups.epoch_ns[solved]
     x_km = groups.x_km[solved]
-    v_km_s, _ = velocities(group_offsets(name), (epoch_ns - epoch_ns[0]) / 1e9, x_km, SLOPE_S)
+    sigma_km, time_s = np.sqrt(traces(groups.cov_km2[solved])), (epoch_ns - epoch_ns[0]) / 1e9
+    v_km_s, _ = velocities(group_offsets(name), time_s, x_km, SLOPE_S, sigma_km)
     at = dict(zip(zip(name, epoch_ns.tolist(), strict=True), range(len(name)), strict=True))
     middles = zip(named.object_id, named.middle_ns.tolist(), strict=True)
     chosen = [at[middle] for middle in middles]

@@ -17,8 +17,14 @@ from epipole.tasks.algorithms.earth_gravity import gravity
 from epipole.tasks.algorithms.geometry.directions import lengths
 from epipole.tasks.algorithms.kernels import kernel
 
+# Least weight of a position in a velocity, over that of the best one of its object: the sums of
+# smaller ones would be lost in rounding.
+MIN_WEIGHT = 1e-5
 
-def velocities(offsets: Integers, time_s: Array, r_km: Array, half_s: float) -> tuple[Array, Array]:
+
+def velocities(
+    offsets: Integers, time_s: Array, r_km: Array, half_s: float, sigma_km: Array | None = None
+) -> tuple[Array, Array]:
     """Return each position's velocity: the slope of its object's positions around it.
 
     Parameters
@@ -29,15 +35,17 @@ def velocities(offsets: Integers, time_s: Array, r_km: Array, half_s: float) -> 
         Times [s] and positions [km], GCRF; NaN positions are skipped.
     half_s
         Half width of the window about each position [s].
+    sigma_km : (n,) float, optional
+        1-sigma errors of the positions [km], which then weigh. Default: all are alike.
 
     Returns
     -------
     v_km_s : (n, 3) float
         Velocities [km/s]; 0 where the window has a single position.
     spread_s : (n,) float
-        Rms distance of the window's times from their mean [s]; 0 where the window has a single
-        position. An error that the positions share in part changes the velocity by at most the
-        error over this.
+        Rms distance of the window's times from their mean, weighted [s]; 0 where the window has a
+        single position. An error that the positions share in part changes the velocity by at most
+        the error over this.
 
     Notes
     -----
@@ -50,28 +58,54 @@ def velocities(offsets: Integers, time_s: Array, r_km: Array, half_s: float) -> 
         if len(known) < 2:
             continue
         t, x = time_s[known] - time_s[known[0]], r_km[known] - r_km[known[0]]
-        at = time_s[lo:hi] - time_s[known[0]]
-        first = np.searchsorted(t, at - half_s, side="left")
-        last = np.searchsorted(t, at + half_s, side="right")
-
-        def total(values: Array, first: Array = first, last: Array = last) -> Array:
-            running = np.concatenate([np.zeros_like(values[:1]), np.cumsum(values, axis=0)])
-            return running[last] - running[first]
-
-        n = np.maximum(last - first, 1)
-        mean_t, square = total(t) / n, total(t * t)
-        spread = square - n * mean_t**2
-        cross = total(t[:, None] * x) - mean_t[:, None] * total(x)
-        # The slope of half the square of the time since `at`.
-        bent = (total(t * t * t) - mean_t * square) / 2 - at * spread
-        fall = gravity(r_km[known[0]] + total(x) / n[:, None])
-        with np.errstate(invalid="ignore", divide="ignore"):
-            slope = (cross - bent[:, None] * fall) / spread[:, None]
+        weight = np.ones(len(known)) if sigma_km is None else _weights(sigma_km[known])
+        window = _Window(t, weight, time_s[lo:hi] - time_s[known[0]], half_s)
+        slope, spread = _slopes(window, x, r_km[known[0]])
         # Below 1e-6 s^2 all positions are of one epoch: the slope is only rounding.
         several = spread > 1e-6
         v_km_s[lo:hi] = np.where(several[:, None], slope, 0.0)
-        spread_s[lo:hi] = np.where(several, np.sqrt(np.maximum(spread, 0.0) / n), 0.0)
+        spread_s[lo:hi] = np.where(several, np.sqrt(np.maximum(spread, 0.0)), 0.0)
     return v_km_s, spread_s
+
+
+def _weights(sigma_km: Array) -> Array:
+    """Return the weights of an object's positions: 1 for the best, `MIN_WEIGHT` at least."""
+    ratio = np.divide(sigma_km.min(), sigma_km, out=np.ones_like(sigma_km), where=sigma_km > 0.0)
+    return np.maximum(ratio**2, MIN_WEIGHT)
+
+
+class _Window:
+    """Weighted sums of an object's positions, at times t [s], within `half_s` of each time `at`."""
+
+    def __init__(self, t: Array, weight: Array, at: Array, half_s: float) -> None:
+        self.t, self.weight, self.at = t, weight, at
+        self._first = np.searchsorted(t, at - half_s, side="left")
+        self._last = np.searchsorted(t, at + half_s, side="right")
+
+    def total(self, values: Array) -> Array:
+        """Return the weighted sum of some values of the positions in each window."""
+        weighted = (values.T * self.weight).T
+        running = np.concatenate([np.zeros_like(weighted[:1]), np.cumsum(weighted, axis=0)])
+        return np.asarray(running[self._last] - running[self._first])
+
+
+def _slopes(window: _Window, x: Array, origin_km: Array) -> tuple[Array, Array]:
+    """Return the slope of the positions in each window [km/s], and the mean square distance of
+    their times from the mean time [s^2].
+
+    x (n, 3) are the positions from `origin_km` (3,) [km] on.
+    """
+    t, at = window.t, window.at
+    n = window.total(np.ones(len(t)))
+    with np.errstate(invalid="ignore", divide="ignore"):
+        mean_t, square = window.total(t) / n, window.total(t * t) / n
+        mean_x = window.total(x) / n[:, None]
+        spread = square - mean_t**2
+        cross = window.total(t[:, None] * x) / n[:, None] - mean_t[:, None] * mean_x
+        # The slope of half the square of the time since `at`.
+        bent = (window.total(t * t * t) / n - mean_t * square) / 2 - at * spread
+        fall = gravity(origin_km + mean_x)
+        return (cross - bent[:, None] * fall) / spread[:, None], spread
 
 
 def neglected_motion(object_state: Array, sensor_state: Array, moments: Array) -> Array:

@@ -193,6 +193,11 @@ def test_positions_are_honest_before_their_velocity_is_known():
     assert 0.8 < squared_errors(20, -50, -31) < 1.2
 
 
+def test_a_velocity_is_that_of_the_good_positions():
+    """The far sensor leaves. From then on the range has an error of 80 km."""
+    assert 0.8 < squared_errors(20, -30, 0) < 1.2
+
+
 def seen_once(rng, rates=True):
     """Views at one epoch of a low object, by a low sensor and a geostationary one; where it is.
 

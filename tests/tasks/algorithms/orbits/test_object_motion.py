@@ -30,6 +30,20 @@ def test_falling_motion_gives_its_velocity_whatever_is_missing():
     np.testing.assert_allclose(spread_s[20:80], np.sqrt(10.0), atol=0.5)  # of -5 to 5 s
 
 
+def test_positions_weigh_by_their_errors():
+    rng, t = np.random.default_rng(1), np.arange(100.0)
+    states, _ = trajectory(LOW, t)
+    sigma_km = np.where(t < 50.0, 0.01, 100.0)
+    x = states[:, :3] + sigma_km[:, None] * rng.normal(size=(100, 3))
+    got, spread_s = velocities(np.array([0, 100]), t, x, 30.0, sigma_km)
+    off = np.abs(got - states[:, 3:]).max(axis=1)
+    assert off[:60].max() < 0.01
+    assert np.abs(velocities(np.array([0, 100]), t, x, 30.0)[0] - got)[40:60].max() > 0.5
+    assert spread_s[70] < 10.0 < spread_s[85]
+    alike, _ = velocities(np.array([0, 100]), t, x, 30.0, np.full(100, 7.0))
+    np.testing.assert_array_equal(alike, velocities(np.array([0, 100]), t, x, 30.0)[0])
+
+
 def test_objects_do_not_mix_and_a_single_position_has_velocity_zero():
     t = np.array([0.0, 1.0, 0.0])
     x = np.array([[1.0, 0, 0], [2.0, 0, 0], [9.0, 9, 9]])
