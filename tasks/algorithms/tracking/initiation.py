@@ -52,6 +52,9 @@ LOG_FAINT_MISS, LOG_FAINT_HIT = np.log(1.0 - P_FAINT), np.log(P_FAINT / P_DETECT
 LOG_FAINT = np.log(0.5)  # prior odds that a chain is such an object
 FAINT_APART, FAINT_FRAMES = 4, 24  # as `APART`; frames that a chain reaches back
 MAX_FAINT_MISSES = 8  # in a row; 3 of 100 chains of such objects have more
+# Least log-evidence of what a chain has behind a gap at which a track would end. A prediction over
+# a gap is wide, and a false alarm is soon within it; a burst of frames on an object adds more.
+MIN_BEHIND_GAP = 5.0
 MAX_FREE = 8.0  # free detections in a frame, up to which faint objects are searched for: with 10 it
 # would take 10 ms
 N_RATES = 24  # classes of rate for which the maximum evidence is tabulated
@@ -320,6 +323,8 @@ def _chain_back(pair, detections, recent, rule, frames, best, wanted, scratch):
     # Misses beyond the oldest detection count only if an older one follows: the object may have
     # entered the field there.
     misses, taken = 0, 0.0
+    # The chain on this side of the last gap that it reached over: what lies behind is uncertain.
+    n_near, evidence_near, taken_near = n, -np.inf, taken
     # `bright` and `dim` are the log-evidence of an object that is detected in most frames, in few.
     for k in range(len(best) - 1):
         evidence = max(bright, dim)
@@ -332,6 +337,10 @@ def _chain_back(pair, detections, recent, rule, frames, best, wanted, scratch):
         dt = times[h] - at
         if dt == 0.0:
             continue
+        if -dt > rule.max_coast[h + 1]:
+            if max(bright, dim) - evidence_near < MIN_BEHIND_GAP:
+                break
+            n_near, evidence_near, taken_near = n, max(bright, dim), taken
         grow(P, rate_of(w), rate_of(bend), dt)
         advance(u, w, bend, dt)
         at = times[h]
@@ -354,6 +363,8 @@ def _chain_back(pair, detections, recent, rule, frames, best, wanted, scratch):
         learn_brightness(scratch.brightness, detections.log_flux[m])
         scratch.members[n] = m
         n += 1
+    if max(bright, dim) - evidence_near < MIN_BEHIND_GAP:
+        return n_near, evidence_near, taken_near
     return n, max(bright, dim), taken
 
 

@@ -14,14 +14,14 @@ SIGMA = 2 * ARCSEC
 
 def scene(
     seed, *, n_objects, n_false, n_frames, rate_arcsec_s, missed=0.05, axis=(0.3, 0.5, 0.8),
-    interval_s=1.0,
+    interval_s=1.0, times=None,
 ):  # fmt: skip
     """Return detections of objects on great circles among false alarms: frame times and offsets,
     directions, and the object of each."""
     rng = np.random.default_rng(seed)
     centre = np.array(axis) / np.linalg.norm(axis)
     basis = tangent_basis(centre)
-    times = np.arange(n_frames) * interval_s
+    times = np.arange(n_frames) * interval_s if times is None else times
     start = rng.uniform(-FIELD / 2, FIELD / 2, (n_objects, 2))
     heading = rng.uniform(0, 2 * np.pi, n_objects)
     rate = rate_arcsec_s * ARCSEC * np.column_stack([np.cos(heading), np.sin(heading)])
@@ -106,6 +106,32 @@ def test_an_hour_between_frames_ends_every_track():
     track = follow(times, offsets, u)
     assert track[0] == 0
     assert track[-1] == 1
+
+
+def test_no_track_takes_a_false_alarm_from_behind_a_gap():
+    """After three minutes, a prediction is so wide that it holds any false alarm."""
+    for seed in range(6):
+        times = np.arange(40.0) + 180.0 * (np.arange(40) >= 20)
+        _, offsets, u, who = scene(
+            seed, n_objects=6, n_false=5, n_frames=40, rate_arcsec_s=10.0, times=times
+        )
+        frame = np.repeat(np.arange(40), np.diff(offsets))
+        track = follow(times, offsets, u)
+        for t in range(track.max() + 1):
+            assert len(set((frame[track == t] >= 20).tolist())) == 1
+            assert (who[track == t] >= 0).all()
+
+
+def test_short_bursts_of_frames_give_tracks_together():
+    """Three detections say too little by themselves, among false alarms."""
+    k = np.arange(45)
+    times, offsets, u, who = scene(
+        7, n_objects=6, n_false=5, n_frames=45, rate_arcsec_s=10.0, times=k // 3 * 10.0 + k % 3 / 2
+    )
+    track = follow(times, offsets, u, max_coast_s=2.25)
+    purity, completeness = score(track, who)
+    assert purity > 0.98
+    assert completeness > 0.85
 
 
 def test_all_detections_on_one_spot_are_no_trouble():
