@@ -9,7 +9,6 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
-import numpy as np
 import polars as pl
 import pyarrow as pa
 
@@ -21,7 +20,6 @@ from epipole.io.work.work_layout import (
     SolvedParts,
     ViewedParts,
 )
-from epipole.schemas.bridge import array
 from epipole.schemas.rejects import Reason
 from epipole.schemas.settings import Settings
 from epipole.schemas.spans import DAY_NS, Sensor, Span, spans_between
@@ -34,7 +32,7 @@ from epipole.tasks.name.linked_objects import (
     without_refused,
 )
 from epipole.tasks.name.object_ids import Names
-from epipole.tasks.solve.align_epochs import EpochGrid, night_grid, usable_frames
+from epipole.tasks.solve.align_epochs import EpochGrid, frame_times, night_grid
 from epipole.tasks.solve.associate_block import associate_blocks, blocks_of
 from epipole.tasks.solve.number_objects import number_objects
 from epipole.tasks.solve.positions import VELOCITY_WINDOW_S
@@ -113,12 +111,11 @@ def solve_objects(
 def epoch_grid(work: Work, settings: Settings) -> EpochGrid:
     """Return the grid of epochs of the night."""
     columns = ["time", "attitude_source", "x_km"]
-    times = []
-    for sensor, spans in work.spans.items():
-        rows = [work.identified[sensor].read(span, "solutions", columns) for span in spans]
-        serving = [array(usable_frames(part), "time") for part in rows]
-        times.append(np.concatenate([np.zeros(0, np.int64), *serving]))
-    return night_grid(times, settings.alignment)
+    sensors = [
+        frame_times([work.identified[sensor].read(span, "solutions", columns) for span in spans])
+        for sensor, spans in work.spans.items()
+    ]
+    return night_grid(sensors, settings.alignment)
 
 
 def _view(night: _Night) -> dict[Span, int]:

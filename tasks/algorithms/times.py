@@ -122,13 +122,13 @@ def frame_intervals_ns(time_ns: Nanoseconds) -> Nanoseconds:
     return np.asarray(np.maximum(out, near[np.clip(first, 0, len(near) - 1)].astype(np.int64)))
 
 
-def epoch_interval_ns(time_ns_by_sensor: list[Nanoseconds]) -> int:
+def epoch_interval_ns(intervals_ns: list[int]) -> int:
     """Return the slowest sensor's frame interval [ns], rounded to 1 ms, at least 1 ms.
 
     Rounding keeps the grid fixed from night to night, whatever the jitter of the exposures.
     Without any interval it is one second.
     """
-    slowest = max((frame_interval_ns(t) for t in time_ns_by_sensor), default=0)
+    slowest = max(intervals_ns, default=0)
     return max(round(slowest / MILLISECOND_NS), 1) * MILLISECOND_NS if slowest else 1_000_000_000
 
 

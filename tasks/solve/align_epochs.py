@@ -29,21 +29,36 @@ class EpochGrid(NamedTuple):
     epochs_ns: tuple[int, ...] | None  # the epochs, if no sensor has a frame interval
 
 
-def night_grid(time_ns: Sequence[Integers], settings: AlignmentSettings) -> EpochGrid:
-    """Return a night's grid of epochs.
+class FrameTimes(NamedTuple):
+    """The times of a sensor's `usable_frames` [ns], in order, and the usual interval of all its
+    frames [ns], 0 with fewer than two."""
 
-    Parameters
-    ----------
-    time_ns
-        For each sensor, the times of its `usable_frames`.
+    usable_ns: Integers
+    interval_ns: int
+
+
+def frame_times(solutions: Sequence[pa.Table]) -> FrameTimes:
+    """Return the times of one sensor's frames; parts of its `solutions`.
+
+    A sensor of which few frames have an attitude is not slow: the interval is that of all frames.
     """
-    interval_s = settings.interval_s
-    if interval_s is not None:
-        return EpochGrid(max(round(interval_s * 1e9), 1), None)
-    interval_ns = epoch_interval_ns(list(time_ns))
-    if any(len(t) > 1 for t in time_ns) or not len(time_ns):
+    usable, every = (
+        np.concatenate([np.zeros(0, np.int64), *(array(part, "time") for part in parts)])
+        for parts in ([usable_frames(part) for part in solutions], solutions)
+    )
+    return FrameTimes(np.sort(usable), frame_interval_ns(every))
+
+
+def night_grid(sensors: Sequence[FrameTimes], settings: AlignmentSettings) -> EpochGrid:
+    """Return a night's grid of epochs: at the interval of the slowest sensor, if not set."""
+    if settings.interval_s is not None:
+        return EpochGrid(max(round(settings.interval_s * 1e9), 1), None)
+    seeing = [sensor for sensor in sensors if len(sensor.usable_ns)]
+    interval_ns = epoch_interval_ns([sensor.interval_ns for sensor in seeing])
+    if any(len(sensor.usable_ns) > 1 for sensor in seeing) or not seeing:
         return EpochGrid(interval_ns, None)
-    return EpochGrid(interval_ns, tuple(instants_of(np.concatenate(time_ns), interval_ns).tolist()))
+    usable_ns = np.concatenate([sensor.usable_ns for sensor in seeing])
+    return EpochGrid(interval_ns, tuple(instants_of(usable_ns, interval_ns).tolist()))
 
 
 def usable_frames(solutions: pa.Table) -> pa.Table:
@@ -62,14 +77,14 @@ def align_epochs(
     served = usable_frames(solutions).sort_by("time")
     sensors = sorted(set(served["sensor_id"].to_pylist()))
     parts = [rows_with(served, "sensor_id", s) for s in sensors]
-    times = [array(part, "time") for part in parts]
+    times = [frame_times([rows_with(solutions, "sensor_id", s)]) for s in sensors]
     if not parts:
         return concat(EPOCHS, [])
     interval_ns, epochs_ns = grid or night_grid(times, settings)
     if epochs_ns is None:
         epochs = epoch_grid(
-            min(int(t[0]) for t in times) - interval_ns // 2,
-            max(int(t[-1]) for t in times) + interval_ns // 2,
+            min(int(t.usable_ns[0]) for t in times) - interval_ns // 2,
+            max(int(t.usable_ns[-1]) for t in times) + interval_ns // 2,
             interval_ns,
         )
     else:
@@ -85,17 +100,17 @@ def _nearest_frames(
     epochs: Integers,
     sensor: str,
     frame_number: Integers,
-    time_ns: Integers,
+    times: FrameTimes,
     interval_ns: int,
     settings: AlignmentSettings,
 ) -> pa.Table:
     """Return EPOCHS of one sensor."""
-    frame = nearest_frame(epochs, time_ns)
-    dt_ns = time_ns[frame] - epochs
+    frame = nearest_frame(epochs, times.usable_ns)
+    dt_ns = times.usable_ns[frame] - epochs
     if settings.max_gap_s is not None:
         limit_ns = settings.max_gap_s * 1e9
     else:
-        limit_ns = max(interval_ns, frame_interval_ns(time_ns)) / 2
+        limit_ns = max(interval_ns, frame_interval_ns(times.usable_ns)) / 2
     near = np.abs(dt_ns) <= limit_ns
     return table(
         EPOCHS,
