@@ -131,7 +131,7 @@ def should_detect(views, s, points, nearest_km2):
         return False
     for m in range(len(views.time_s)):
         if points.seen_by[m] >= 2:
-            range2 = _range2(views.camera, s, m, points.x_km[m])
+            range2 = range2_of(views.camera, s, m, points.x_km[m])
             if range2 > MAX_RANGE_RATIO * MAX_RANGE_RATIO * nearest_km2:
                 return False
             return not _blends(views, s, m, points.x_km[m])
@@ -177,14 +177,14 @@ def nearest_range2(views, members, points):
             continue
         for i in members:
             if views.seen[i, m]:
-                range2 = _range2(views.camera, views.sensor[i], m, points.x_km[m])
+                range2 = range2_of(views.camera, views.sensor[i], m, points.x_km[m])
                 nearest2 = min(nearest2, range2)
         break
     return nearest2
 
 
 @borrowing_kernel
-def _range2(cam, s, m, x):
+def range2_of(cam, s, m, x):
     """Return the squared range [km^2] from sensor s at instant m to the point x.
 
     `cam` (s, k, 34) is `Views.camera`, `x` (3,) [km], GCRF.

@@ -1,14 +1,15 @@
 """Leftover seeds: where no pair of sensors has looked for an object.
 
 Among many sensors only some pairs seed, enough to cover the middle of the space that they share
-(`sensor_pairs`). In the corners of their fields, an object may be seen by two that were skipped. So
+(`sensor_pairs`). In the corners of their fields, an object may be seen by two that were skipped;
+and so may one that is near to these two, and too faint for the sensors of the pairs. So
 the tracklets that are in no group at the end are compared with each other. Without that, 14 of 48
 objects in the corners of two of 8 or 16 fields were lost.
 """
 
 import numpy as np
 
-from epipole.tasks.algorithms.association.odds import in_view
+from epipole.tasks.algorithms.association.odds import MAX_RANGE_RATIO, in_view, range2_of
 from epipole.tasks.algorithms.association.search.search_space import doubled
 from epipole.tasks.algorithms.association.search.seeds import meet
 from epipole.tasks.algorithms.association.search.sight_lines import meeting_point
@@ -30,7 +31,8 @@ def leftover_seeds(space, pairs, enough, gate_sigma):
     pairs
         `RankedPairs`: tracklets of those that were skipped are compared.
     enough : float
-        Where this number of the pairs that have seeded see the point, they would have found it.
+        Where this number of the pairs that have seeded should see the point, they would have found
+        it. A sensor that is much farther away than the two need not see it.
     gate_sigma : float
         As in `seeds_between`.
     """
@@ -48,7 +50,8 @@ def leftover_seeds(space, pairs, enough, gate_sigma):
                 if m < 0 or not meet(space, i, j, m, gate_sigma, work):
                     continue
                 meeting_point(views, i, j, m, work, x)
-                if _is_covered(views, pairs, m, x, enough, sees):
+                _write_seeing(views, (a, b), m, x, sees)
+                if _is_covered(pairs, enough, sees):
                     continue
                 if n == len(out):
                     out = doubled(out, n)
@@ -77,13 +80,27 @@ def _first_shared(views, i, j):
 
 
 @borrowing_kernel
-def _is_covered(views, pairs, m, x, enough, sees):
-    """Return whether `enough` pairs that have seeded have x (3,) [km] in their fields.
+def _write_seeing(views, of_seed, m, x, sees):
+    """Write which sensors should see an object at x (3,) [km] at instant m to `sees` (s,).
 
-    That is at instant m; `sees` (s,) bool is work space.
+    They have x in their fields, and are not much farther away than the nearer one of two sensors
+    that do see it, `of_seed`: for the others it may be too faint, as in `odds.should_detect`.
     """
+    one, other = of_seed
+    nearest2 = min(range2_of(views.camera, one, m, x), range2_of(views.camera, other, m, x))
     for s in range(len(sees)):
-        sees[s] = in_view(views.camera[s, m], x)
+        sees[s] = (
+            in_view(views.camera[s, m], x)
+            and range2_of(views.camera, s, m, x) <= MAX_RANGE_RATIO * MAX_RANGE_RATIO * nearest2
+        )
+
+
+@borrowing_kernel
+def _is_covered(pairs, enough, sees):
+    """Return whether `enough` pairs have seeded of two sensors that should see a point.
+
+    `sees` (s,) bool are these sensors.
+    """
     n = 0
     for k in range(len(pairs.a)):
         n += not pairs.waiting[k] and sees[pairs.a[k]] and sees[pairs.b[k]]

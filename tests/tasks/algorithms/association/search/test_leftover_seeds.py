@@ -3,10 +3,13 @@
 import numpy as np
 import pytest
 from scenes.ten_tracklets import GATE_SIGMA, in_field, point, ten_tracklets
+from scenes.tracklet_scenes import GEO
 
+from epipole.tasks.algorithms.association.odds import MAX_RANGE_RATIO
 from epipole.tasks.algorithms.association.search.leftover_seeds import MAX_LEFT, leftover_seeds
 from epipole.tasks.algorithms.association.search.seeds import seeds_between
 from epipole.tasks.algorithms.association.search.sensor_pairs import RankedPairs
+from epipole.tasks.algorithms.association.views import PLANE, R_KM
 
 
 def pairs_of(n_sensors, n_seeded):
@@ -45,18 +48,34 @@ def test_free_tracklets_of_skipped_pairs_are_seeds_where_they_meet(seed):
 
 @pytest.mark.parametrize("enough", [1.0, 2.0, 3.0])
 @pytest.mark.parametrize("seed", range(3))
-def test_what_enough_pairs_have_in_their_fields_is_no_seed(seed, enough):
+def test_what_enough_pairs_should_have_seen_is_no_seed(seed, enough):
     scene = ten_tracklets(seed, n_sensors=4, n_objects=8, spread_km=40.0)
     pairs = pairs_of(4, 3)
     seeded = list(zip(pairs.a[~pairs.waiting], pairs.b[~pairs.waiting], strict=True))
     expected, of_skipped = set(), of_pairs(scene, pairs)
     for i, j in of_skipped:
         x = point(scene.samples, (i, j), 0)[0]
-        looking = [a for a in range(4) if in_field(scene.samples, a, 0, x)]
+        range_km = np.linalg.norm(x - scene.samples.sensor_km[:, 0], axis=1)
+        farthest_km = MAX_RANGE_RATIO * range_km[scene.space.views.sensor[[i, j]]].min()
+        looking = [
+            a for a in range(4)
+            if in_field(scene.samples, a, 0, x) and range_km[a] <= farthest_km
+        ]  # fmt: skip
         if sum(a in looking and b in looking for a, b in seeded) < enough:
             expected.add((i, j))
     assert seeds(scene, pairs, enough) == expected
     assert expected != of_skipped
+
+
+def test_sensors_that_are_much_farther_away_do_not_cover_what_is_too_faint_for_them():
+    scene = ten_tracklets(1, n_sensors=4, n_objects=8, n_strays=0, spread_km=1.0)
+    pairs = pairs_of(4, 1)
+    assert seeds(scene, pairs, 1.0) == set()  # sensors 2 and 3 have seeded, and have all objects
+    place_km = scene.space.views.camera[2:, :, R_KM:PLANE]
+    place_km[:] = GEO + 1.6 * (place_km - GEO)
+    found = seeds(scene, pairs, 1.0)
+    sensor = scene.space.views.sensor
+    assert {(int(sensor[i]), int(sensor[j])) for i, j in found} >= {(0, 1)}
 
 
 def test_sensors_with_many_tracklets_left_take_no_part():
