@@ -12,6 +12,7 @@ from epipole.schemas.tables import POSITIONS, REJECTS
 from epipole.tasks.algorithms.constants import SPEED_OF_LIGHT_KM_S
 from epipole.tasks.algorithms.geometry.covariances import traces
 from epipole.tasks.algorithms.geometry.directions import lengths
+from epipole.tasks.algorithms.geometry.moved_planes import on_moved_plane
 from epipole.tasks.algorithms.geometry.triangulation import triangulate
 from epipole.tasks.algorithms.orbits.object_motion import (
     keep_independent,
@@ -121,7 +122,12 @@ def with_neglected_motion(
     u /= lengths(u)[:, None]
     removed = np.where(known, neglected - error**2, 0.0)
     cov = views.cov_noise - removed[:, None, None] * np.eye(2)
-    return views._replace(u=u, cov_noise=cov, unmodelled=neglected - removed)
+    return views._replace(
+        u=u,
+        cov_noise=on_moved_plane(cov, views.u, u),
+        cov_bias=on_moved_plane(views.cov_bias, views.u, u),
+        unmodelled=neglected - removed,
+    )
 
 
 def _independent(groups: ViewGroups, span: Span | None) -> Flags:

@@ -13,10 +13,17 @@ import pyarrow.compute as pc
 
 from epipole.io.work.work_layout import NOTHING_ADDED, AddedErrors
 from epipole.schemas.arrays import Array, Flags, Indices
-from epipole.schemas.bridge import array, stack, stack_covariance, unstack
+from epipole.schemas.bridge import (
+    array,
+    stack,
+    stack_covariance,
+    unstack,
+    unstack_covariance,
+)
 from epipole.schemas.columns import TANGENT_AXES
 from epipole.tasks.algorithms.constants import SPEED_OF_LIGHT_KM_S
 from epipole.tasks.algorithms.geometry.directions import apparent_positions
+from epipole.tasks.algorithms.geometry.moved_planes import on_moved_plane
 from epipole.tasks.common.grouping import factorize
 
 # Columns of VIEWS that are only passed on.
@@ -97,12 +104,14 @@ def with_added_errors(views: pa.Table, added: AddedErrors) -> pa.Table:
     if fault.left_rad:
         u, w = stack(views, "u{}"), stack(views, "w{}_rad_s")
         right = u - np.cross(fault.bias_rad, u)
-        columns |= unstack("u{}", right / np.linalg.norm(right, axis=1, keepdims=True))
+        right /= np.linalg.norm(right, axis=1, keepdims=True)
+        columns |= unstack("u{}", right)
         columns |= unstack("w{}_rad_s", w - np.cross(fault.bias_rad, w))
-        names = [f"cov_bias_{axis}{axis}_rad2" for axis in TANGENT_AXES]
-        columns |= {
-            name: array(views, name) + fault.left_rad**2 for name in (*names, "attitude_rad2")
-        }
+        for part, more in (("noise", 0.0), ("bias", fault.left_rad**2)):
+            cov = stack_covariance(views, f"cov_{part}_{{}}_rad2", TANGENT_AXES)
+            cov = on_moved_plane(cov, u, right) + more * np.eye(2)
+            columns |= unstack_covariance(f"cov_{part}_{{}}_rad2", cov, TANGENT_AXES)
+        columns["attitude_rad2"] = array(views, "attitude_rad2") + fault.left_rad**2
     for name, values in columns.items():
         at = views.schema.get_field_index(name)
         views = views.set_column(at, views.schema.field(at), pa.array(values))
