@@ -1,4 +1,4 @@
-"""The doctor of logs: what is written as it says, what is not, and what cannot be known."""
+"""The doctor: what is sound in logs, what is wrong, and what logs alone cannot show."""
 
 from collections.abc import Sequence
 from typing import Any, NamedTuple
@@ -21,7 +21,7 @@ from epipole.tasks.read.judge_logs import judge_logs, judged_sensors
 from epipole.tasks.read.order_frames import OrderedFrames, order_logs, states_between
 from epipole.tasks.read.read_logs import read_log_into
 
-# What states and frames do not show, whatever they are. A run shows part of it by lines of sight.
+# Mistakes that states and frames can never show. A run shows some of them by lines of sight.
 NOT_SHOWN = (
     "the time scale, if frames and states have the same wrong one",
     "GCRF, EME2000 or TEME, and axes exchanged or negated in states that do not turn with the "
@@ -33,8 +33,12 @@ NOT_SHOWN = (
 
 
 class Diagnosis(NamedTuple):
-    """What the doctor found: CHECKS of all sensors, counts of what was read, a sentence for each
-    reason why something was left out, and sensors that are assumed on but have nothing here."""
+    """What the doctor found.
+
+    `checks` are CHECKS of all sensors; `logs`, `frames` and `states` count what was read.
+    `left_out` has a sentence for each reason why something was left out. `assumed_in_vain` are
+    sensors of the setting `sensors.assume` that these logs do not have.
+    """
 
     checks: pa.Table
     logs: int
@@ -68,19 +72,19 @@ def doctor(logs: Sequence[str], settings: Settings = Settings()) -> Diagnosis:  
         Where a file is not a log, or the logs have neither frames nor states.
     """
     given = find_logs(logs, None)
-    with temporary_folder("doctor") as made:
-        folder = ReadFolder(made)
+    with temporary_folder("doctor") as path:
+        folder = ReadFolder(path)
         read = [
-            read_log_into(folder, k, path, settings.sensors.assume)
-            for k, path in enumerate(given.paths)
+            read_log_into(folder, k, log, settings.sensors.assume)
+            for k, log in enumerate(given.paths)
         ]
         frames = order_logs(folder, read, settings.sensors)
-        if not frames.sensors and not left_out(concat(REJECTS, [given.rejects, frames.rejects])):
+        rejects = concat(REJECTS, [given.rejects, frames.rejects])
+        if not frames.sensors and not left_out(rejects):
             raise LogError(
                 f"{', '.join(given.paths)}: neither frames nor states in these logs; "
                 "check the recording"
             )
-        rejects = concat(REJECTS, [given.rejects, frames.rejects])
         known = {EVERY_SENSOR, *frames.sensors, *frames.cameras["sensor_id"].to_pylist()}
         checks = judge_logs.fn(
             Batch(judged_sensors(frames)), frames.cameras, rejects, ALL_TIME,
@@ -90,13 +94,13 @@ def doctor(logs: Sequence[str], settings: Settings = Settings()) -> Diagnosis:  
             checks,
             len(given.paths),
             frames.n_frames,
-            sum(_states(frames, number) for number in range(len(frames.sensors))),
+            sum(_n_states(frames, number) for number in range(len(frames.sensors))),
             left_out(rejects),
             sorted({each.sensor for each in settings.sensors.assume} - known),
         )
 
 
-def _states(frames: OrderedFrames, number: int) -> int:
+def _n_states(frames: OrderedFrames, number: int) -> int:
     return int(states_between(frames.folder, number, *ALL_TIME).num_rows)
 
 
@@ -116,7 +120,7 @@ def as_dict(found: Diagnosis) -> dict[str, Any]:
 
 
 def lines(found: Diagnosis) -> list[str]:
-    """Return a diagnosis as lines for people: what is wrong first."""
+    """Return a diagnosis as lines of text: of each sensor, what is wrong comes first."""
     out = [f"{many(found.frames, 'frame')} and {many(found.states, 'state')} "
            f"in {many(found.logs, 'log')}"]  # fmt: skip
     if found.assumed_in_vain:

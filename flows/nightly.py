@@ -135,17 +135,17 @@ def nightly(
     earlier = tuple(
         sentence
         for date in sorted({*before, *waiting})
-        if (sentence := made_before(order._replace(again=date in remade), date))
+        if (sentence := make_earlier_night(order._replace(again=date in remade), date))
     )
     try:
-        summary = recorded(order, asked)
+        summary = make_and_record(order, asked)
     except NoFramesError as error:
         raise NoFramesError("; ".join([str(error), *earlier])) from error
     return dataclasses.replace(summary, earlier=earlier)
 
 
 class Order(NamedTuple):
-    """What is asked of a run, but for the nights; `logged` is for `find_logs`."""
+    """What a run is to do, without the nights; `logged` is the argument of `find_logs`."""
 
     logs: list[str]
     out: str
@@ -156,13 +156,13 @@ class Order(NamedTuple):
     logged: dict[str, tuple[int, int] | None]
 
 
-def made_before(order: Order, night: str) -> str | None:
+def make_earlier_night(order: Order, night: str) -> str | None:
     """Make a night before the one that is asked for; return a sentence, None if nothing was to do.
 
-    What is wrong with it does not stop the night that is asked for.
+    If it fails, the night that is asked for is made all the same.
     """
     try:
-        summary = recorded(order, night, asked=False)
+        summary = make_and_record(order, night, asked=False)
     except NoFramesError:
         return None
     except EpipoleError as error:
@@ -171,10 +171,11 @@ def made_before(order: Order, night: str) -> str | None:
     return None if summary.unchanged else f"{night} made: {summary.sentence()}"
 
 
-def recorded(order: Order, night: str | None, asked: bool = True) -> Summary:
-    """Make nights as `make_nights` does; record how that ended, and tell what needs a look, once.
+def make_and_record(order: Order, night: str | None, asked: bool = True) -> Summary:
+    """Make nights as `make_nights` does, record how that ended, and tell once what needs a look.
 
-    Where the run that has `asked` for the night fails, its state tells.
+    `asked`: the run is for this night. Then Prefect shows a failure; only a night without frames
+    is reported here.
     """
     used = Stopwatch.start()
     try:
@@ -217,21 +218,21 @@ def make_nights(order: Order, night: str | None) -> Summary:
         check_sources(out, chosen, sources, replace)
         run_key = [*frames.sensors, *sorted(log.sha256 for log in frames.sources)]
         staged: dict[str, Path] = {}
-        with lock_nights(out, [] if night else chosen) as staging, ExitStack() as kept:
+        with lock_nights(out, [] if night else chosen) as staging, ExitStack() as folders:
             for date in chosen:
                 if len(chosen) > 1:
                     LOGGER.info("night %s", date)
                 made = gave_something(frames.sources, frames.rejects, date)
                 recipe = recipe_of(night_logs_key(given, date, made), settings, known_key)
                 work = work_folder(work_root(out), date, recipe, settings.work.keep, run_key)
-                folder = kept.enter_context(work)
+                folder = folders.enter_context(work)
                 rejects = into_nights(
                     concat(REJECTS, [given.rejects, frames.rejects]), nights, date
                 )
-                whole = {"sources": sources, "rejects": rejects}
+                of_run = {"sources": sources, "rejects": rejects}
                 earlier = EarlierNights(out, staged)
                 folder_of_night = staging / f"night={date}"
-                stage_night(frames, date, folder, whole, earlier, catalogue, recipe,
+                stage_night(frames, date, folder, of_run, earlier, catalogue, recipe,
                             folder_of_night, settings)  # fmt: skip
                 staged[date] = folder_of_night
             summary = publish(Destination(out, staged, replace), sources)
@@ -241,21 +242,21 @@ def make_nights(order: Order, night: str | None) -> Summary:
 
 
 def stage_night(
-    frames: OrderedFrames, date: str, folder: WorkFolder, whole: Mapping[str, pa.Table],
+    frames: OrderedFrames, date: str, folder: WorkFolder, of_run: Mapping[str, pa.Table],
     earlier: EarlierNights, catalogue: KnownObjects | None, recipe: Recipe, staged: Path,
     settings: Settings,
 ) -> None:  # fmt: skip
     """Make a night from the frames of a run, and write its tables to the folder `staged`.
 
-    `whole` are `sources` and `rejects` of the run.
+    `of_run` are its tables `sources` and `rejects`.
     """
     made = make_night(frames, date, folder, earlier.usual_sensors(date), settings)
     earlier_key = earlier.key(date, settings)
     names = name(made.work, made.solved, date, earlier.last_views(date), settings)
     elements, unused = choose_elements(catalogue, date, settings)
-    rejects = concat(REJECTS, [whole["rejects"], made.rejects, unused])
-    whole = {**whole, **made.tables, "rejects": rejects}
-    linked = write_night(made.work, made.solved, date, names, whole, staged, settings)
+    rejects = concat(REJECTS, [of_run["rejects"], made.rejects, unused])
+    tables = {**of_run, **made.tables, "rejects": rejects}
+    linked = write_night(made.work, made.solved, date, names, tables, staged, settings)
     verdicts = determine_orbits(staged, date, linked)
     before = earlier.last_objects(date, settings)
     residuals = name_known(staged, elements, before, settings)
@@ -265,7 +266,7 @@ def stage_night(
 
 
 class MadeNight(NamedTuple):
-    """The objects of a night, solved: `tables`, by name, and `rejects` belong to no span."""
+    """The solved objects of a night; `tables` (by name) and `rejects` that belong to no span."""
 
     work: Work
     solved: SolvedParts
@@ -278,8 +279,8 @@ def make_night(
 ) -> MadeNight:
     """Turn the frames of a night, and of half an hour before and after it, into solved objects.
 
-    What a night holds does not depend on the other nights of the run, but for the check whether
-    its sensors are there: `usual` are those of nights before.
+    The result does not depend on the other nights of the run. Only the check for missing sensors
+    does: `usual` are those of nights before.
     """
     checks = check_logs(frames, night, usual, settings)
     spans, left_out = plan_spans(frames, night, wrong_velocities(checks))

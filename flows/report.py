@@ -11,11 +11,11 @@ from epipole.io.datasets.dataset import night_row, nights_in, report_location
 from epipole.io.paths import fault_of_name, file_system, storage_errors
 from epipole.schemas.errors import DatasetError, ReportError
 
-HEAD = 4096  # bytes of a page that have its verdict
+HEAD = 4096  # bytes at the beginning of a page: its verdict is in them
 
 
 def report(dataset: str, night: str | None, out: Path) -> int:
-    """Write the report of a night, or of None the calendar; return its size in bytes.
+    """Write the report of a night, or the calendar (None); return its size in bytes.
 
     Raises
     ------
@@ -52,10 +52,10 @@ def _calendar(dataset: str, nights: list[str], out: Path) -> str:
         except DatasetError:
             row = None
         page = report_location(dataset, night)
-        said = VERDICT.search(_head_of(page))
-        address = _address(page, out) if said else ""
+        verdict = VERDICT.search(_head_of(page))
+        address = _address(page, out) if verdict else ""
         looks = records[night]["needs_look"] if night in records else []
-        found.append(CalendarNight(night, row, looks, said[1] if said else "", address))
+        found.append(CalendarNight(night, row, looks, verdict[1] if verdict else "", address))
     return calendar_page(dataset, found)
 
 
@@ -70,7 +70,7 @@ def _head_of(page: str) -> str:
 
 
 def _address(page: str, out: Path) -> str:
-    """Return where a link leads; '' where no browser can go, such as s3://."""
+    """Return the link from `out` to a page; '' if a browser cannot open it, such as s3://."""
     if "://" in page:
         return page if page.startswith(("http://", "https://")) else ""
     relative = os.path.relpath(page, out.parent)
@@ -78,7 +78,7 @@ def _address(page: str, out: Path) -> str:
 
 
 def _write(out: Path, data: bytes) -> int:
-    """Write a file, whole or not at all."""
+    """Write a file, whole or not at all; return its size in bytes."""
     try:
         out.parent.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryDirectory(prefix=".report-", dir=out.parent) as made:

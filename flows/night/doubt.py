@@ -1,11 +1,11 @@
-"""Doubt: what is solved where sensors disagree, be it clear or not who is wrong.
+"""Doubt: how a night is solved again where sensors disagree.
 
-A sensor that is wrong takes part without its fault, or is left out.
+If it is clear which sensors are wrong, their faults are taken off, or they are left out.
 
-Sensors that agree with each other may be those that are wrong. So where no more sensors agree than
-not, or several sets of faults explain the lines of sight as well, no sensor is left out: the
-positions of all sensors get an error as large as the disagreement shows, and the night is solved
-with it. Its positions have the covariances of such errors.
+Sensors that agree with each other may be the wrong ones. So if no majority agrees, or several sets
+of faults explain the lines of sight equally well, no sensor is left out. The positions of all
+sensors get an error as large as the disagreement. The night is solved with it, and the covariances
+of the objects contain it.
 """
 
 import logging
@@ -28,20 +28,20 @@ from epipole.tasks.check.check_sensors import SPEED_KM_S, SensorVerdict, add_fau
 
 LOGGER = logging.getLogger(__name__)
 
-MAX_ROUNDS = 3  # in which faults are found that others hid; two of seven sensors took two
+MAX_ROUNDS = 3  # of judging without the faults found so far; two faults of seven sensors took two
 WIDE_KM = 10.0  # error with which all sensors take part, to learn how far they disagree
-# The spread is that about the mean of all sensors. If half of them have the same error, their mean
-# is off by as much. With 1, half of the positions lay outside their 99 % ellipsoids then; with 2
-# and 3, none.
+# Factor on the spread of the sensors about their mean: if half of them share an error, the mean is
+# off by as much. With 1, half of the positions were then outside their 99 % ellipsoids; with 2 and
+# 3, none.
 MARGIN = 2.0
-# Of errors larger than stated, which are nobody's in particular. Sound scenes have up to 1.4.
+# Minimum log odds that errors of all sensors are larger than stated. Sound scenes have up to 1.4.
 MIN_LOG_ODDS = 6.0
 
 
 class Settled(NamedTuple):
-    """A night that is solved, and what is wrong without a name; None where nothing is.
+    """A night that is solved. Without `doubt`, it is clear which sensors are wrong, if any.
 
-    `clocks` are those that are wrong, be they corrected or not.
+    `clocks` are the verdicts on wrong clocks, whether they were corrected or not.
     """
 
     work: Work
@@ -53,10 +53,7 @@ class Settled(NamedTuple):
 def settle(work: Work, solved: SolvedParts, checked: Checked, settings: Settings) -> Settled:
     """Solve a night again where sensors are at fault, or in doubt.
 
-    Parameters
-    ----------
-    work
-        As it was before the check.
+    `work` and `solved` are of the last round of `track` and `solve`, `checked` is their check.
     """
     window_s = settings.association.window_s
     if not in_doubt(checked.work, solved, checked, window_s):
@@ -74,7 +71,7 @@ def settle(work: Work, solved: SolvedParts, checked: Checked, settings: Settings
         "sensors disagree, and who is wrong is not clear: an error of %.2g km per axis is added "
         "to the positions of all %s", more_km, many(len(work.spans), "sensor"),
     )  # fmt: skip
-    unnamed = tuple(one._replace(cause=SOUND) for one in judged.work.verdicts)
+    unnamed = tuple(verdict._replace(cause=SOUND) for verdict in judged.work.verdicts)
     solved = solve(work, settings, added=AddedErrors(more_km))
     return Settled(judged.work._replace(verdicts=unnamed), solved, judged.doubt, clocks)
 
@@ -82,13 +79,13 @@ def settle(work: Work, solved: SolvedParts, checked: Checked, settings: Settings
 def _judge_left_out(
     work: Work, solved: SolvedParts, checked: Checked, settings: Settings
 ) -> Checked:
-    """Return the check with verdicts on sensors that are so wrong that they join no objects.
+    """Return a check that also judges sensors that are too wrong to join objects.
 
-    Parameters are those of `settle`. Such sensors take part with a wide error. The check stays as
-    it is if others are at fault then, or it is not clear who is.
+    They take part with a wide error, as do sensors left out. If other sensors are at fault then, or
+    it is not clear which, `checked` is returned. Parameters are those of `settle`.
     """
     window_s = settings.association.window_s
-    named = {one.sensor_id for one in checked.work.verdicts if one.is_faulty}
+    named = {verdict.sensor_id for verdict in checked.work.verdicts if verdict.is_faulty}
     sides = _sides(work, solved, window_s)
     apart = (sides.disagree | sides.unclear) - named
     if not apart:
@@ -99,26 +96,26 @@ def _judge_left_out(
         added=AddedErrors(faults=tuple(SensorFault(s, WIDE_KM, left_km=WIDE_KM) for s in suspects)),
     )  # fmt: skip
     judged = check(work, wide, settings, correct=False)
-    faulty = {one.sensor_id for one in judged.work.verdicts if one.is_faulty}
+    faulty = {verdict.sensor_id for verdict in judged.work.verdicts if verdict.is_faulty}
     is_clear = not in_doubt(judged.work, wide, judged, window_s)
-    as_before = (
+    is_consistent = (
         faulty <= named.union(suspects) and judged.left_out.keys() >= checked.left_out.keys()
     )
-    return judged if is_clear and as_before else checked
+    return judged if is_clear and is_consistent else checked
 
 
 def _solve_with_faults(
     work: Work, solved: SolvedParts, checked: Checked, settings: Settings
 ) -> Settled | None:
-    """Solve a night without the faults of its sensors, until there is no other; None in doubt.
+    """Solve a night without the faults of its sensors, until no other is found; None in doubt.
 
-    Sensors whose fault is unknown or too large are left out. A fault may hide another one, so the
-    sensors are judged again without it. Parameters are those of `settle`.
+    Sensors whose fault is unknown or too large are left out. A fault may hide another one: so the
+    sensors are judged again after each solution. Parameters are those of `settle`.
     """
     left_out: dict[str, Reason] = {}
     verdicts = checked.work.verdicts
     for _ in range(MAX_ROUNDS):
-        faults = tuple(fault for one in verdicts if (fault := one.fault()) is not None)
+        faults = tuple(f for verdict in verdicts if (f := verdict.fault()) is not None)
         taking_part = {fault.sensor_id for fault in faults}
         left_out |= {name: why for name, why in checked.left_out.items() if name not in taking_part}
         if not (checked.left_out or faults):
@@ -127,7 +124,7 @@ def _solve_with_faults(
         checked = check(work, solved, settings, correct=False)
         if in_doubt(checked.work, solved, checked, settings.association.window_s):
             return None
-        still_wrong = {one.sensor_id for one in verdicts if one.is_still_wrong}
+        still_wrong = {verdict.sensor_id for verdict in verdicts if verdict.is_still_wrong}
         if checked.left_out.keys() <= still_wrong:
             break
         verdicts = tuple(add_faults(verdicts, checked.work.verdicts))
@@ -137,7 +134,7 @@ def _solve_with_faults(
 
 
 def _error_km(*doubts: Doubt) -> float:
-    """Return the error of the positions of all sensors that the disagreement shows."""
+    """Return the error [km] per axis of all sensors' positions that explains the disagreement."""
     shared = [abs(each.shared_s) for each in doubts if np.isfinite(each.shared_s)]
     moved_km = SPEED_KM_S * max(shared, default=0.0)
     return max(MARGIN * max(each.spread_km for each in doubts), moved_km)
@@ -145,27 +142,31 @@ def _error_km(*doubts: Doubt) -> float:
 
 def _clocks(verdicts: Iterable[SensorVerdict]) -> tuple[SensorVerdict, ...]:
     """Return the verdicts on clocks that are wrong."""
-    return tuple(one for one in verdicts if one.has_wrong_clock)
+    return tuple(verdict for verdict in verdicts if verdict.has_wrong_clock)
 
 
 def in_doubt(work: Work, solved: SolvedParts, checked: Checked, window_s: float) -> bool:
     """Return whether it is not clear which sensors are wrong; `window_s` is that of association.
 
-    A clock is wrong against the states of the same sensor: it needs no others that agree.
+    It is clear if no sensor disagrees, or those that agree are a majority. Wrong clocks count on
+    neither side: the states of the same sensor show them, without other sensors.
     """
     doubt = checked.doubt
     if doubt.undecided or np.isfinite(doubt.shared_s) or doubt.spread_log_odds > MIN_LOG_ODDS:
         return True
     agree, disagree, _ = _sides(work, solved, window_s)
-    late = {one.sensor_id for one in _clocks(checked.work.verdicts)}
+    late = {verdict.sensor_id for verdict in _clocks(checked.work.verdicts)}
     faulty = {name for name, why in checked.left_out.items() if why != Reason.CLOCK_OFF}
     agree, disagree = agree - set(checked.left_out) - late, (disagree - late) | faulty
     return bool(disagree) and len(agree) < max(len(disagree) + 1, LEAST_AGREEING)
 
 
 class _Sides(NamedTuple):
-    """Sensors that have objects with others, those mostly left out at that, and those of the first
-    whose tracklets mostly may be of an object, or not."""
+    """Sensors by what became of their tracklets.
+
+    `disagree`: more are left out than in objects. Of the other sensors, `agree`: some are in
+    objects; `unclear`: more are undecided than in objects.
+    """
 
     agree: set[str]
     disagree: set[str]
@@ -173,7 +174,7 @@ class _Sides(NamedTuple):
 
 
 def _sides(work: Work, solved: SolvedParts, window_s: float) -> _Sides:
-    """Return who agrees with whom, by tracklets and windows of association, of `window_s` [s]."""
+    """Return which sensors agree: each tracklet counts once per window of `window_s` [s]."""
     names = {sensor.number: sensor.sensor_id for sensor in work.spans}
     joined, left_out, unclear = (dict.fromkeys(names.values(), 0) for _ in range(3))
     for span in work.all_spans():

@@ -39,7 +39,7 @@ def order(dataset: Path) -> flow.Order:
 def test_the_metrics_of_a_night_are_its_counts(tmp_path, monkeypatch):
     both = replace(published(tmp_path, {NIGHT: 3, NEXT: 4}), frames=7)
     monkeypatch.setattr(flow, "make_nights", lambda *_: both)
-    flow.recorded(order(tmp_path), None)
+    flow.make_and_record(order(tmp_path), None)
     metrics = (tmp_path / "runs" / "last.prom").read_text()
     assert f'epipole_night_frames{{night="{NEXT}"}} 4\n' in metrics
 
@@ -60,13 +60,13 @@ def test_a_run_that_publishes_nothing_leaves_what_needs_a_look(tmp_path, monkeyp
         return found["state"], found["needs_look"]
 
     monkeypatch.setattr(flow, "make_nights", make)
-    flow.recorded(order(tmp_path), NIGHT)
+    flow.make_and_record(order(tmp_path), NIGHT)
     assert record() == ("made", LOOKS)
     for error, state in ((DatasetError, "failed"), (NoFramesError, "no frames")):
         with pytest.raises(error):
-            flow.recorded(order(tmp_path), NIGHT)
+            flow.make_and_record(order(tmp_path), NIGHT)
         assert record() == (state, LOOKS)
-    assert flow.recorded(order(tmp_path), NIGHT).looks == {NIGHT: LOOKS}
+    assert flow.make_and_record(order(tmp_path), NIGHT).looks == {NIGHT: LOOKS}
     assert record() == ("made", LOOKS)
 
 
