@@ -9,12 +9,12 @@ import tomllib
 from typing import Any
 
 LONGEST_LINE = 1000
-# What Markdown, or the HTML in it, could take for more than text.
+# Characters that could be marks in Markdown, or in the HTML in it.
 _MARKED = re.compile(r"[^\w\s,.;/()=+%-]|_|(?<=www)\.", re.IGNORECASE)
 
 
 def as_line(text: object, longest: int = LONGEST_LINE) -> str:
-    """Return a text as one line: what cannot be printed as an escape, such as ``\\n``, and cut."""
+    """Return a text as one line, cut to `longest`; ``\\n`` and the like become escapes."""
     line = "".join(c if c.isprintable() else _escaped(c) for c in str(text)[: longest + 1])
     return line if len(line) <= longest else line[: longest - 3] + "..."
 
@@ -73,16 +73,16 @@ _USER = re.compile(r"(?<=://)[^/?#\n]*@")
 _QUERY = re.compile(r"(://[^\s'\"<>?#]*)[?#]([^\s'\"<>]*=[^\s'\"<>]*|[\w%~+/-]{16,})")
 _ENDS = ".,:;)]}"
 
-# Parameters of a query whose values say which file it is. Of all others the values are cut: a
-# signature, a token and when they become void have another name in each store.
+# Parameters of a query that say which file it is. All others are removed: a signature, a token and
+# their time of expiry have another name in each store.
 _PLAIN = {"file", "filename", "path", "name", "version", "versionid"}
 
 
 def without_secrets(text: str) -> str:
     """Return a text with its URLs as they may be shown: without user, password and signature.
 
-    ``https://me:pw@host/a.mcap?token=x`` becomes ``https://host/a.mcap``. So a URL is the same
-    whatever its password is today.
+    ``https://me:pw@host/a.mcap?token=x`` becomes ``https://host/a.mcap``. So a URL stays the same
+    when its password changes.
     """
     return _QUERY.sub(_without_values, _USER.sub("", text)) if "://" in text else text
 

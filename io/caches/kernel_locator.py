@@ -26,7 +26,7 @@ class KernelLocator(_CacheLocator):
 
     @classmethod
     def from_function(cls, py_func: Callable[..., Any], py_file: str) -> "KernelLocator | None":
-        """Return the locator of a kernel of this package; None: numba goes on to its others."""
+        """Return the locator of a kernel of this package, None for others: numba tries its next."""
         folder = _folder_of(py_func.__module__)
         return None if folder is None else cls(py_func, folder)
 
@@ -44,7 +44,7 @@ class KernelLocator(_CacheLocator):
 
 
 def locate_kernels(folder_of: _FolderOf) -> None:
-    """Have numba look for kernels in the folder that this returns for their module, from now on."""
+    """Let numba look for the kernels of a module in the folder `folder_of(module)`, from now on."""
     global _folder_of
     _folder_of = folder_of
     if KernelLocator not in CacheImpl._locator_classes:
@@ -52,9 +52,9 @@ def locate_kernels(folder_of: _FolderOf) -> None:
 
 
 def use_target(name: str) -> None:
-    """Compile for this processor, by LLVM's name, without anything beyond it.
+    """Compile for a processor, by LLVM's name, and use none of this machine's other features.
 
-    For all functions that numba compiles in this process from now on: it has one target.
+    Holds for all that numba compiles in this process from now on: it has a single target.
     """
     numba.config.CPU_NAME = name  # type: ignore[attr-defined]
     numba.config.CPU_FEATURES = ""  # type: ignore[attr-defined]

@@ -1,7 +1,8 @@
-"""When the messages of a log were logged, and its bytes up to a time: found without reading them.
+"""When a log's messages were logged, and the digest of its bytes up to a time.
 
-A log that was never closed has no summary: it is still being written, or its recorder was stopped.
-Then the heads of its chunks say it, and also where a summary has no statistics.
+Both come from the log's summary, without reading messages. A log that was never closed has no
+summary: it is still being written, or its recorder was stopped. Then, and where a summary has no
+statistics, they come from the heads of its chunks.
 """
 
 import hashlib
@@ -24,7 +25,7 @@ from epipole.io.logs.mcap.record_scan import CHUNK, DATA_END, MESSAGE
 from epipole.schemas.errors import LogError
 from epipole.schemas.rejects import Reason
 
-# Records of an unclosed log that are looked at: of a log without chunks each message is one.
+# Maximum number of records of an unclosed log: in a log without chunks, each message is one.
 MAX_RECORDS = 50_000
 HASHED_BYTES = 1 << 20  # at once
 
@@ -55,8 +56,8 @@ def open_mcap(where: str) -> LogBytes:
 def read_log_times(path: str | os.PathLike[str]) -> tuple[int, int] | None:
     """Return when a log's first and last message were logged, without reading them.
 
-    UTC nanoseconds since 1970, of the recorder's clock: not the times of frames. None where
-    neither its summary nor its chunks tell. Only `read_log` finds them then.
+    UTC nanoseconds since 1970, of the recorder's clock: not the times of frames. None if neither
+    summary nor chunks have them: then the log has to be read.
 
     Raises
     ------
@@ -68,7 +69,7 @@ def read_log_times(path: str | os.PathLike[str]) -> tuple[int, int] | None:
         if summary.logged_ns is not None:
             return summary.logged_ns if summary.logged_ns != (0, 0) else None  # no messages
         try:
-            chunks = list(_walked_chunks(data))
+            chunks = list(_walk_chunks(data))
         except ChunkError:
             return None
     times = [t for chunk in chunks for t in chunk[1:] if t]  # a chunk without messages has zeros
@@ -83,16 +84,16 @@ class ReadBytes(NamedTuple):
 
 
 def read_digest(path: str, until_ns: int, read: ReadBytes | None = None) -> str:
-    """Return the SHA-256 of a log; of one that goes on after a time, of its bytes before.
+    """Return the SHA-256 of a log; if the log goes on after `until_ns`, of its bytes before that.
 
-    These end where the first chunk begins whose messages were all logged at that time or after it.
-    So they are the same while the log is still being written.
+    They end at the first chunk whose messages were all logged at `until_ns` or later. So the digest
+    is the same while the log is still being written.
 
     Parameters
     ----------
     read
-        What a run has read of it. The log may have grown since: what came before that time and was
-        not read is not in the digest, so that the next run finds it.
+        What a run has read of it. The log may have grown since. If it grew by messages from before
+        `until_ns`, the digest is that of what was read: so the next run sees a change.
     """
     with open_mcap(path) as data:
         try:
@@ -114,18 +115,18 @@ def _chunks(data: LogBytes) -> Iterator[ChunkTimes]:
     """Yield the chunks of a log, by its summary where it has one."""
     summary = read_summary(data, ChannelTable(frozenset()))
     if summary.data_end is None:
-        yield from _walked_chunks(data)
+        yield from _walk_chunks(data)
     times_ns = iter(summary.chunk_times)
     yield from map(ChunkTimes, summary.chunk_offsets, times_ns, times_ns)
 
 
-def _walked_chunks(data: LogBytes) -> Iterator[ChunkTimes]:
+def _walk_chunks(data: LogBytes) -> Iterator[ChunkTimes]:
     """Yield the chunks of a log from record to record; the last one may be incomplete.
 
     Raises
     ------
     ChunkError
-        Where the records between them are damaged, or have messages: then no chunk tells the times.
+        If records outside chunks are damaged, or are messages: then chunks do not have all times.
     """
     at = len(MAGIC)
     near_at, near = 0, memoryview(b"")  # records that follow: of a URL each read is a request

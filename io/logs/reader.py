@@ -1,4 +1,4 @@
-"""Logs in: an MCAP file of frames, states and calibrations to tables.
+"""Read a log: an MCAP file of frames, states and calibrations becomes tables.
 
 Channels are chosen by the name of their schema. Their messages may be in any registered
 encoding, and one log may mix encodings. Damage does not stop the reading: what cannot be used
@@ -87,7 +87,7 @@ def read_log_pieces(
     A piece has about `piece_bytes` of frames, states and calibrations, at most one chunk of the
     log more. Each message comes once, in the order of the file. There is at least one piece. The
     last one has the rejects and the source, with the log's time range: frames outside it are
-    strays. `as_meant` returns a state that was written otherwise than it should be as it was meant.
+    strays. `as_meant` corrects states that a log has wrong in a known way.
     """
     where = known_as(os.fspath(path))
     with open_mcap(where) as data, ThreadPoolExecutor(THREADS, "open chunks") as pool:
@@ -123,7 +123,7 @@ class _Reading:
         self._walk = RecordWalk(data, frozenset(kinds_of_schemas()), pool)
         self._frames_ns: list[Nanoseconds] = []
         self._states_ns: list[Nanoseconds] = []
-        # Channels in unknown encodings, by number, and their messages.
+        # Channels in unknown encodings, by number, with the number of their messages.
         self._unknown: dict[int, tuple[Channel, int]] = {}
 
     def blocks(self) -> Iterator[Block]:

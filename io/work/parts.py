@@ -131,7 +131,7 @@ def _columns(schema: pa.Schema) -> str:
     return ", ".join(str(field.remove_metadata()) for field in schema)
 
 
-CLOCK_NS = 10_000_000_000  # the largest correction of a clock
+CLOCK_NS = 10_000_000_000  # the largest correction of a clock [ns]
 
 
 def write_part(
@@ -148,8 +148,8 @@ def write_part(
     declared
         The tables that the part must have: one of `epipole.io.work.parts`.
     within
-        A folder of the part that must exist. It is not made: a task that outlives its run would
-        bring the run's folder back.
+        A parent folder that must exist. It is not created: a task that outlives its run would
+        create the run's folder again.
     key
         That of `part_key`, by which a later run may find it; None: it is made in every run.
 
@@ -225,7 +225,7 @@ class Parts(NamedTuple):
         return self.folder / span.folder
 
     def of_night(self) -> Path:
-        """Return the part that all spans together give."""
+        """Return the part of the whole night, of all spans together."""
         return self.folder / "night"
 
     def read(self, span: Span, name: str, columns: Sequence[str] | None = None) -> pa.Table:
@@ -237,7 +237,7 @@ class Parts(NamedTuple):
         return is_written(self.of(span))
 
     def take(self, span: Span, key: str | None) -> bool:
-        """Return whether the span's part could be taken from those kept; see `take_part`."""
+        """Take the span's part from those kept; return whether it was there. See `take_part`."""
         return take_part(self.of(span), self.kept, key)
 
     def written(self, spans: Iterable[Span]) -> list[Path]:

@@ -1,4 +1,4 @@
-"""The bytes of a log: of a file, or of a URL of which each block is fetched once.
+"""The bytes of a log: a local file, or a URL from which each block is fetched once.
 
 A file is read, not mapped: if another program cuts a mapped file short, the process that reads it
 is killed without a message.
@@ -27,7 +27,8 @@ class BlockReader:
     """Reads ranges of a remote file; for one thread at a time.
 
     Before `stream`, each read fetches exactly its range, which suits scattered reads. After it,
-    blocks are fetched ahead, and the SHA-256 is computed from them.
+    blocks are fetched ahead, and the SHA-256 is computed from them. `fetch` returns the bytes from
+    one offset to before another; `check` raises if the file has changed.
     """
 
     def __init__(
@@ -58,10 +59,7 @@ class BlockReader:
         return pieces[0] if len(pieces) == 1 else b"".join(pieces)
 
     def sha256(self) -> str:
-        """Return the SHA-256 of the whole file; what is still missing is fetched now.
-
-        What `check` raises is raised here, when everything has been fetched.
-        """
+        """Return the SHA-256 of the whole file; fetch what was not read, and call `check` last."""
         self.stream()
         for k in range(self._hash.n_taken, -(-self._size // BLOCK_BYTES)):
             self._block(k)
@@ -75,7 +73,7 @@ class BlockReader:
         self._hash.close()
 
     def _block(self, k: int) -> memoryview:
-        """Return a block; blocks before it that were not read yet are hashed first."""
+        """Return block k; blocks before it that were not read yet are fetched and hashed first."""
         for passed in range(self._hash.n_taken, k):
             self._hash.take(self._fetched(passed))
         block = self._fetched(k)
@@ -84,6 +82,7 @@ class BlockReader:
         return block
 
     def _fetched(self, k: int) -> memoryview:
+        """Return block k, and begin to fetch those ahead of it."""
         for i in range(k, k + 1 + AHEAD):
             if i in self._blocks:
                 self._blocks.move_to_end(i)

@@ -1,4 +1,4 @@
-"""The segments of records in a chunk or outside, found by compiled loops over the bytes."""
+"""Where records lie, in a chunk or outside chunks: compiled loops over the bytes."""
 
 from collections.abc import Iterator
 from typing import Any, NamedTuple
@@ -94,8 +94,7 @@ def index_records(data: Bytes, outside: bool = False) -> Iterator[RecordIndex]:
     data
         Consecutive records.
     outside
-        They are a run outside chunks (see `length_outside`), where attachments and metadata
-        belong.
+        They lie outside chunks (see `length_outside`), where attachments and metadata belong.
     """
     at, more = 0, True
     while more:
@@ -108,7 +107,7 @@ def index_records(data: Bytes, outside: bool = False) -> Iterator[RecordIndex]:
 
 
 def length_outside(data: Bytes) -> int:
-    """Return the length of the run that `data` begins with: to a chunk, or the end of the data."""
+    """Return the length [bytes] of the records up to the first chunk, or the end of the data."""
     return int(_walk(data, 0, True, True, len(data), *_columns(0))[1])
 
 
@@ -223,16 +222,16 @@ def _walk_indexes(data, limit, number, counted):
 
 
 def changed_declarations(data: Bytes, index: RecordIndex, last: Hashes) -> Flags:
-    """Return which records are no repetition of the last declaration under their number.
+    """Return (n,) bool: false for declarations that repeat the last one of the same number.
 
-    Some recorders declare a channel before each of its messages. `last` are the hashes of these
-    declarations, from `no_declarations`; they are brought up to date.
+    Some recorders declare a channel before each of its messages. `last` are the hashes of the last
+    declarations, from `no_declarations`; they are updated. True for messages.
     """
     return _changed(data, index.opcode, index.start, index.end, last)
 
 
 def no_declarations() -> Hashes:
-    """Return the hashes of the last schema and the last channel under each number: none."""
+    """Return the hashes for `changed_declarations` before any declaration: all zero."""
     return np.zeros((2, 1 << 16), np.uint64)
 
 
@@ -240,8 +239,7 @@ def no_declarations() -> Hashes:
 def _changed(data, opcode, start, end, last):
     """Return which records are no repetition, (n,) bool; see `changed_declarations`.
 
-    The columns (n,) are of `RecordIndex`; `last` (2, 65536), of schemas and of channels, is brought
-    up to date.
+    The columns (n,) are of `RecordIndex`; `last` (2, 65536), schemas and channels, is updated.
     """
     changed = np.ones(len(opcode), np.bool_)
     for i in range(len(opcode)):

@@ -60,9 +60,8 @@ _TYPES = {
 def file_descriptor(arrays_as_bytes: bool = False) -> descriptor_pb2.FileDescriptorProto:
     """Return the declared messages as a protobuf file, as a compiled `epipole.proto` would be.
 
-    With `arrays_as_bytes` the repeated numbers are declared as bytes. A packed array and bytes
-    are the same on the wire. A message that is read in this way gives each array as bytes,
-    without a Python object per number.
+    With `arrays_as_bytes` the repeated numbers are declared as bytes, which are encoded in the same
+    way as a packed array. Arrays are then read as bytes, without a Python object per number.
     """
     file = descriptor_pb2.FileDescriptorProto(
         name="epipole.proto",
@@ -171,7 +170,7 @@ def _timestamp(time_ns: int) -> bytes:
 
 _WIRE = {"time": 2, "string": 2, "uint64": 0, "double": 1, "float": 5}
 _NUMBERS = {"double": "<f8", "float": "<f4"}
-# Of each field: its name, its type, whether it is an array, its tag.
+# For each kind of message, its fields: name, type, whether it is an array, tag.
 _PLANS = {
     kind: [
         (m.name, m.type, m.repeated, varint(m.number << 3 | (2 if m.repeated else _WIRE[m.type])))
@@ -218,7 +217,7 @@ def _encode_calibration(values: Values) -> bytes:
 
 
 def decode(kind: str, data: bytes) -> DecodedMessage:
-    """Return the message that protobuf holds; raise ValueError where it holds none."""
+    """Return the message that the bytes encode; raise ValueError if they are invalid."""
     try:
         if kind == CALIBRATION:
             return _calibration(data)
@@ -229,10 +228,10 @@ def decode(kind: str, data: bytes) -> DecodedMessage:
 
 
 def _parse(message_type: MessageType, data: bytes) -> Any:
-    """Return the message with its arrays as bytes where these give back every byte.
+    """Return the message, with its arrays as bytes if that reads all of `data`.
 
-    They do not where arrays are unpacked or in pieces, or where there are unknown fields; the
-    arrays are numbers then.
+    It does not if an array is unpacked or in pieces, or if a field is unknown. The arrays are then
+    numbers.
     """
     message = message_class(message_type, True)()
     message.ParseFromString(data)
