@@ -118,10 +118,10 @@ FOLD_STEPS = 4000
 
 @lru_cache(maxsize=256)
 def fold_radius(camera: Camera) -> float:
-    """Return the ideal distance from which the radial distortion folds back; inf: it does not.
+    """Return the ideal distance [focal lengths] where radial distortion folds back; inf: nowhere.
 
-    Beyond it, two directions would have one pixel position. A lens shows nothing there. Of a
-    fisheye it is `WIDEST_RAD` at most.
+    Beyond it, two directions would have one pixel position; a lens shows nothing there. For a
+    fisheye it is at most `WIDEST_RAD`.
     """
     farthest = WIDEST_RAD if camera.fisheye else FARTHEST
     unfolded = WIDEST_RAD if camera.fisheye else float(np.inf)
@@ -223,7 +223,7 @@ def _bend_slopes(camera: Camera, x: Array, y: Array) -> tuple[Array, Array, Arra
 def undistort(camera: Camera, xd: Array, yd: Array) -> tuple[Array, Array]:
     """Return the normalised coordinates that `distort` maps to (xd, yd), by Newton's method.
 
-    NaN where no direction before the fold of the distortion has this position, as in the corners of
+    NaN where no direction inside the fold of the distortion has this position, as in the corners of
     a wide lens's image.
     """
     if not camera.distorts:
@@ -231,8 +231,8 @@ def undistort(camera: Camera, xd: Array, yd: Array) -> tuple[Array, Array]:
     return _direction(camera, *_straighten(camera, xd, yd))
 
 
-# Of Newton's method: most steps, of which ordinary lenses take four, and the longest one over the
-# distance from the principal point. Where the image hardly grows, a whole step leads far away.
+# Newton's method: maximum number of steps (ordinary lenses take four), and maximum length of a step
+# over the distance from the principal point. Near a fold, an undamped step leads far away.
 MAX_STEPS, LONGEST_STEP = 40, 0.2
 
 
@@ -249,32 +249,31 @@ def _straighten(camera: Camera, xd: Array, yd: Array) -> tuple[Array, Array]:
         jxx, jxy, jyy = _bend_slopes(camera, x, y)
         determinant = jxx * jyy - jxy * jxy
         dx, dy = (jyy * ex - jxy * ey) / determinant, (jxx * ey - jxy * ex) / determinant
-        part = longest / np.maximum(np.hypot(dx, dy), np.maximum(longest, 1e-300))
-        x, y = x - part * dx, y - part * dy
+        damping = longest / np.maximum(np.hypot(dx, dy), np.maximum(longest, 1e-300))
+        x, y = x - damping * dx, y - damping * dy
         if last:
             break
         if np.isfinite(fold):
-            x, y = _before(fold, x, y)
+            x, y = _inside_fold(fold, x, y)
     ex, ey = _bend(camera, x, y)
     found = (np.hypot(ex - xd, ey - yd) < 1e-7) & (np.hypot(x, y) <= fold)
     return np.where(found, x, np.nan), np.where(found, y, np.nan)
 
 
 def ends_of_fold(camera: Camera, n: int) -> tuple[Array, Array]:
-    """Return directions (x, y, 1) at the fold of the distortion that lie in the image: of n around
-    the boresight."""
+    """Return those of n directions (x, y, 1) around the fold of the distortion that are in view."""
     turn = np.linspace(0.0, 2 * np.pi, n, endpoint=False)
     r = (1 - 1e-9) * fold_radius(camera)  # rounding must not put them beyond
     if not np.isfinite(r):
         return np.empty(0), np.empty(0)
     x, y = r * np.cos(turn), r * np.sin(turn)
     xd, yd = _bend(camera, x, y)
-    at = inside(camera, camera.cx_px + camera.fx_px * xd, camera.cy_px + camera.fy_px * yd)
-    return _direction(camera, x[at], y[at])
+    shown = inside(camera, camera.cx_px + camera.fx_px * xd, camera.cy_px + camera.fy_px * yd)
+    return _direction(camera, x[shown], y[shown])
 
 
-def _before(fold: float, x: Array, y: Array) -> tuple[Array, Array]:
-    """Return points (n,), those from the fold on moved to just before it."""
+def _inside_fold(fold: float, x: Array, y: Array) -> tuple[Array, Array]:
+    """Return points (n,); those at or beyond the fold are moved to just inside it."""
     shrunk = 0.999 * fold / np.maximum(np.hypot(x, y), 0.999 * fold)
     return x * shrunk, y * shrunk
 

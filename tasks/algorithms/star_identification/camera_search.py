@@ -14,6 +14,7 @@ For a sensor that identifies nothing with its nominal calibration.
 import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from operator import attrgetter
 from typing import NamedTuple
 
 import numpy as np
@@ -122,10 +123,6 @@ class _Match(NamedTuple):
         return int(np.sum(self.solution.star >= 0))
 
 
-def _n_stars(match: _Match) -> int:
-    return match.n_stars
-
-
 def find_cameras(
     frames: Sequence[ImageFrame],
     nominal: Camera,
@@ -181,38 +178,39 @@ def _best_match(
 
     `log_reach` is the largest change of the logarithm of the focal length.
     """
-    found, sides = [], [nominal, mirrored(nominal)]
-    plain = _first_match(frame, sides, log_reach, trials)
+    found, orientations = [], [nominal, mirrored(nominal)]
+    plain = _first_match(frame, orientations, log_reach, trials)
     if plain is not None:
-        found, sides = [plain, _with_fitted_k1(frame, plain, trials.matching)], [plain.camera]
+        found = [plain, _with_fitted_k1(frame, plain, trials.matching)]
+        orientations = [plain.camera]
         if any(match.n_stars > ENOUGH_MATCHED * len(frame.x_px) for match in found):
-            return max(found, key=_n_stars)
+            return max(found, key=attrgetter("n_stars"))
     for share in DISTORTIONS:
-        distorted = [_distorted(side, share) for side in sides]
+        distorted = [_distorted(camera, share) for camera in orientations]
         match = _first_match(frame, distorted, min(log_reach, DISTORTED_REACH), trials)
         if match is not None:
             found.append(_with_fitted_k1(frame, match, trials.matching))
-    return max(found, key=_n_stars, default=None)
+    return max(found, key=attrgetter("n_stars"), default=None)
 
 
 def _first_match(
-    frame: ImageFrame, sides: Sequence[Camera], log_reach: float, trials: _Trials
+    frame: ImageFrame, orientations: Sequence[Camera], log_reach: float, trials: _Trials
 ) -> _Match | None:
     """Return the camera with the first focal length that matches stars.
 
-    None if none does, or if the trials have cost too much before. `sides` are the camera with rows
-    that count down and up, or the one of these that is known.
+    None if no trial does, or if the trials have cost too much before. `orientations` are the camera
+    with rows that count down and up, or only the right one.
     """
     for block in _blocks(log_reach):
         if trials.is_spent():
             return None
         ratios = list(block)
-        shared = _shared_sky(frame, sides[0], ratios, trials.skies_of)
+        shared = _shared_sky(frame, orientations[0], ratios, trials.skies_of)
         for ratio in ratios:
-            for side in sides:
+            for camera in orientations:
                 if trials.is_spent():
                     return None
-                found = _try(frame, _scaled(side, ratio), shared, trials)
+                found = _try(frame, _scaled(camera, ratio), shared, trials)
                 if found is not None:
                     return found
     return None
@@ -230,7 +228,7 @@ def _with_fitted_k1(frame: ImageFrame, match: _Match, matching: MatchSettings) -
         if solution is None:
             break
         match = match._replace(camera=camera, solution=solution)
-        best = max(match, best, key=_n_stars)
+        best = max(match, best, key=attrgetter("n_stars"))
     return best
 
 

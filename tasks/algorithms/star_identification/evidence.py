@@ -11,8 +11,8 @@ the attitude predicts them, and with each centroid anywhere in the image. Its pa
 - the attitude was chosen among all: the share of the prior's volume that the data leave. Lost in
   space, that is sqrt(det 2 pi P) / (8 pi^2).
 
-So the log evidence does not depend on how many hypotheses were tried. The probability that chance
-alone reaches x is below exp(-x), by Markov's inequality. `chance_margin` says how far below.
+So the log evidence does not depend on how many hypotheses were tried. The false-alarm probability
+of an evidence x is below exp(-x), by Markov's inequality. `chance_margin` says how far below.
 """
 
 import math
@@ -33,8 +33,8 @@ OUTLIER_SHARE = 0.15  # of stars with another brightness: variables, blends, odd
 MAG_RANGE = 6.0  # over which the brightness of such stars is even
 # Stars per field over their mean: the sky is uneven.
 DENSITIES = (0.6, 1.0, 1.4)
-# Of the attitudes that chance gives, a search reports this share (ln) at most: others that come
-# near and matches that are not clear rule them out. Measured: a tenth (bench_false_alarms).
+# Maximum share (ln) of the false alarms that a search reports: the others are refused because of a
+# rival, or of matches that are not clear. Measured: a tenth (bench_false_alarms).
 REPORTED = -1.5
 
 
@@ -115,13 +115,13 @@ def log_ways(n, matches, in_view):
 
 @kernel
 def chance_margin(matches, n, in_view):
-    """Return how far chance stays below Markov's bound: lost in space, it reaches a log evidence x
-    with this number of matches in a starless frame with a probability below exp(-(x + margin)).
+    """Return how far the false-alarm probability is below Markov's bound (compiled).
 
-    Over such frames, the mean of exp(evidence), summed over all attitudes and sets of k matches, is
-    the prior probability of k matches: that of `log_ways`, here over fields whose stars are Poisson
-    distributed. With it, the mean number of attitudes above x follows from the volume of residuals
-    that leave so much: 2 k - 3 degrees of freedom, chi-square as of true stars (compiled).
+    Lost in space, a starless frame reaches a log evidence x with this number k of matches with a
+    probability below exp(-(x + margin)). Over such frames, the mean of exp(evidence), summed over
+    all attitudes and sets of k matches, is the prior probability of k matches: that of `log_ways`,
+    here with a Poisson number of stars. The volume of residuals that leave at least x then gives
+    the mean number of attitudes above x: 2 k - 3 degrees of freedom, chi-square as of true stars.
 
     Parameters
     ----------

@@ -36,8 +36,8 @@ class Memory(NamedTuple):
 
     t_s, R, P : (2,), (2, 3, 3), (2, 3, 3): times [s], attitudes, sensor from ICRS, and covariances
         about the sensor axes [rad^2] of the last two identified frames, the later one last
-    counters : (3,) int64: number of these frames, 0 to 2; 1 where the last prior of an identified
-        frame was confirmed; number of further frames that are not searched
+    counters : (3,) int64: number of these frames, 0 to 2; 1 after a frame was identified by its
+        prior, 0 after one by a search; number of further frames that are not searched
     near, cone : (stars,) int64 and (5,): the stars around a field; how many, the direction
         (3 numbers) and the radius [rad] of the cone that holds them
     """

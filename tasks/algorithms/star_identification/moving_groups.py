@@ -1,15 +1,15 @@
 """Stars in a crowd, by their motion.
 
 Where most centroids of a frame are satellites that the sensor follows, or spots that stay on their
-pixels, a search among all of them fails, or takes long. But one rotation takes all stars from a
-frame to a later one, and not the others with them. So the centroids are divided into groups, each
-of which one rotation takes along. A group of a few stars is soon searched.
+pixels, a search among all of them fails, or takes long. But one rotation moves all stars from a
+frame to a later one, and it does not fit the others. So the centroids are divided into groups, each
+with one rotation. A group of a few stars is searched quickly.
 
 1. Links: each centroid with each one near it in the later frame.
-2. The most frequent shift gives a rotation; what that takes along is the first group: the crowd.
+2. The most frequent shift gives a rotation. The links that it fits are the first group: the crowd.
 3. Of the others, two links agree if the distance between their centroids is the same in both
-   frames. The link with which most agree, and these, give a rotation, and the next group.
-4. Step 3 again, without the centroids of that group.
+   frames. The link with which most others agree gives, with these, the next rotation and group.
+4. Step 3 is repeated without the centroids of that group.
 """
 
 from collections.abc import Iterator
@@ -24,18 +24,18 @@ from epipole.tasks.algorithms.geometry.attitude import optimal_attitude
 from epipole.tasks.algorithms.star_identification.centroids import RawCentroids
 
 # Times between the two frames [s]; sensors that follow satellites turn by 0.01 deg/s against the
-# stars, those that look away from the Earth by 0.06. The later frame may be later by `LATE`.
+# stars, those that look away from the Earth by 0.06. A gap may be longer by the factor `LATE`.
 GAPS_S, LATE = (10.0, 1.0), 2.0
 REACH = 0.2  # of the half diagonal of the image: the farthest that stars move between the frames
 MAX_ROLL_RAD = 0.15  # between the frames
-# Error of a link [px], and at least this many sigmas of a centroid: satellites of a crowd move by
+# Error of a link, the larger of these [px] and [sigma of a centroid]: satellites of a crowd move by
 # half a pixel against each other in 10 s.
 TOLERANCE_PX, TOLERANCE_SIGMA = 1.0, 5.0
 MIN_GROUP = 4  # centroids; among 60 random points, three links often agree
-MAX_SHARE = 0.5  # of a frame's centroids: a larger group are no few stars, or are found without
+MAX_SHARE = 0.5  # of a frame's centroids: stars in a larger group are found without it
 BRIGHTEST = 150  # centroids of a frame that take part: links grow as their square
-MAX_LINKS = 600  # of which it is asked which agree: as many pairs as their square
-MAX_GROUPS, MAX_SEEDS, ROUNDS = 6, 12, 4  # of two frames; links tried for them; fits of a rotation
+MAX_LINKS = 600  # of which each is compared with each
+MAX_GROUPS, MAX_SEEDS, ROUNDS = 6, 12, 4  # per pair of frames; links tried; fits of a rotation
 
 
 def moving_groups(
@@ -110,7 +110,7 @@ def groups_that_move(u: Array, v: Array, reach: float, tolerance: float) -> Iter
     if len(i) < MIN_GROUP:
         return
     members = _densest(v[k] - u[i], 2.0 * tolerance)
-    members = _taken_along(u[i], v[k], np.ones(len(i), bool), members, tolerance)
+    members = _fitted_links(u[i], v[k], np.ones(len(i), bool), members, tolerance)
     if len(np.unique(i[members])) >= MIN_GROUP:
         yield np.unique(i[members])
         left = ~(np.isin(i, i[members]) | np.isin(k, k[members]))
@@ -120,7 +120,7 @@ def groups_that_move(u: Array, v: Array, reach: float, tolerance: float) -> Iter
 
 
 def _densest(points: Array, radius: float) -> Flags:
-    """Return which points lie about the one that has most of them near."""
+    """Return which points (n, 3) are within `radius` of the one with most others near it."""
     tree = KDTree(points)
     middle = np.argmax(tree.query_ball_point(points, radius, return_length=True))
     return np.asarray(np.linalg.norm(points - points[middle], axis=1) < radius)
@@ -137,7 +137,7 @@ def _groups_that_agree(
         seed = int(np.argmax(votes)) if len(votes) else 0
         if groups == MAX_GROUPS or not len(votes) or votes[seed] < MIN_GROUP - 1:
             return
-        members = _taken_along(u[i], v[k], free, (agree[seed] > 0) & free, tolerance)
+        members = _fitted_links(u[i], v[k], free, (agree[seed] > 0) & free, tolerance)
         group = np.unique(i[members])
         if len(group) < MIN_GROUP:
             free[seed] = False
@@ -157,17 +157,11 @@ def _agreement(
     return agree.astype(np.float32)
 
 
-def _taken_along(
-    u: Array,
-    v: Array,
-    free: Flags,
-    members: Flags,
-    tolerance: float,
-) -> Flags:
-    """Return which free links the rotation of the members takes along, fitted some times."""
+def _fitted_links(u: Array, v: Array, free: Flags, members: Flags, tolerance: float) -> Flags:
+    """Return which free links the rotation of the members fits, refined with these links."""
     for _ in range(ROUNDS):
-        equal = np.ones(members.sum())
-        R, _ = optimal_attitude(v[members], u[members], equal)
+        weights = np.ones(members.sum())
+        R, _ = optimal_attitude(v[members], u[members], weights)
         taken = free & (np.linalg.norm(u @ R.T - v, axis=1) < tolerance)
         if taken.sum() < MIN_GROUP or np.array_equal(taken, members):
             return taken

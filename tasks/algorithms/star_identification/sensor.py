@@ -80,18 +80,18 @@ STARS_PER_CENTROID, ASSUMED_IN_VIEW = 1.2, 10.0
 BRIGHTER_MAG, MIN_IN_VIEW = (1.0, 2.0), 5.0
 # Centroid errors that are tried: factors on stated ones, or pixels where none are stated.
 KNOWN_SCALES, UNKNOWN_SCALES_PX = (1.0, 3.0, 0.4), (0.5, 1.5, 0.15)
-# Median of stated errors [px] that `KNOWN_SCALES` correct: from a third of the least error of a
-# camera to the blur of a lens. Beyond, the pixels of unknown errors are tried too.
+# Range of the median stated error [px] in which `KNOWN_SCALES` are enough: from a third of the
+# least error of a camera to the blur of a lens. Outside it, `UNKNOWN_SCALES_PX` are tried too.
 CREDIBLE_PX = (0.02, 3.0)
 # Relative error of the learned centroid error above which all frames are matched again. With half
 # or twice of it the same frames are identified, and squared errors over covariance change by 0.03.
 WRONG_GATE = 0.02
 # Frames that are spread over this time [s] are too far apart to be followed one from another.
 APART_S = 1e9
-# Of the searches' budget, the probe may cost the first share. Of what is left when a pass begins,
-# the pass over all frames may cost the second, any other pass the third.
+# Maximum cost of the probe, as a share of the searches' budget; of the pass over all frames, and of
+# any other pass, as a share of what is left when it begins.
 PROBE_SHARE, ALL_SHARE, SHARE = 0.4, 0.7, 0.4
-THOROUGH = 12.0  # how many times as much as a quick attempt a thorough one of the probe may cost
+THOROUGH = 12.0  # maximum cost of a thorough attempt of the probe, over that of a quick one
 
 
 class IdentifiedSensor(NamedTuple):
@@ -172,7 +172,7 @@ def identify_sensor(
     )  # fmt: skip
     solutions, quality = by_quality(frames, solutions, quality, skies, model)
     return IdentifiedSensor(
-        solutions, _open_status(status, solutions), skies.sky(model.limit), model.scale * quality,
+        solutions, _status_now(status, solutions), skies.sky(model.limit), model.scale * quality,
         floor_px,
     )  # fmt: skip
 
@@ -183,8 +183,8 @@ def _fill_sigmas(centroids: RawCentroids) -> tuple[RawCentroids, bool]:
     return centroids._replace(sigma_px=sigma_px), bool(np.isfinite(sigma_px).any())
 
 
-def _open_status(status: Statuses, solutions: Solutions) -> Statuses:
-    """Return the status of each frame, None where it is solved by now."""
+def _status_now(status: Statuses, solutions: Solutions) -> Statuses:
+    """Return the status of each frame: None where it has been solved since."""
     return [None if solved else s for s, solved in zip(status, solutions.solved, strict=True)]
 
 
@@ -198,9 +198,9 @@ def _probe(
     matching: MatchSettings,
     stated: bool,
 ) -> tuple[FrameSample, SensorModel, _Probe]:
-    """Return the frames, a first model and the probed frames, of which it identifies some or none.
+    """Return the frames, a first model, and the probed frames with what it identifies of them.
 
-    Where moving groups were searched and are of stars, they have given some frames a prior.
+    Frames with a moving group of stars have its solution as a prior.
     """
     centroids = frames.centroids
     usable = np.flatnonzero(centroids.counts >= MIN_CENTROIDS)
@@ -238,7 +238,7 @@ def _tried_scales(centroids: RawCentroids, stated: bool) -> tuple[float, ...]:
 
 
 def _are_stars(frames: FrameSample, skies: Skies, model: SensorModel, scale: float) -> bool:
-    """Return whether all of some frames are identified at once: they are no crowd."""
+    """Return whether a short search identifies all of these frames: then they are not a crowd."""
     tried = model._replace(scale=scale, matching=_quick(model.matching))
     return bool(identify_sample(frames, skies, tried, share=FIRST_SHARE)[0].solved.all())
 
@@ -255,8 +255,7 @@ def _assumed_limit(centroids: RawCentroids, typical: float, crowded: bool, skies
 def _anchored_by_motion(
     frames: FrameSample, rows: Indices, skies: Skies, model: SensorModel, scales: tuple[float, ...]
 ) -> FrameSample:
-    """Return the frames with solutions of these rows' moving groups as priors; the same frames
-    where no group is of stars."""
+    """Return the frames; where moving groups of these rows are stars, with solutions as priors."""
     groups, of_frame = moving_groups(frames.centroids, frames.t_s, rows)
     if not len(of_frame):
         return frames
@@ -283,7 +282,7 @@ class _Attempt(NamedTuple):
     """One search of the probed frames.
 
     model : what is assumed of the sensor
-    thorough : whether the search may take long, and is one of a crowd
+    thorough : whether the search may take long, and looks for stars in a crowd
     """
 
     model: SensorModel
@@ -300,7 +299,7 @@ def _first_scale(
     """
     attempts = _attempts(probe.centroids, skies, model, scales, crowded)
     matching = model.matching
-    # Each attempt is one more chance of a false alarm.
+    # Each attempt may give a false alarm.
     threshold = matching.threshold + np.log(len(attempts))
     thorough = matching._replace(threshold=threshold)
     quick = _quick(thorough)
@@ -339,11 +338,7 @@ def _probe_share(n_probed: int) -> float:
 
 
 def _attempts(
-    probe: RawCentroids,
-    skies: Skies,
-    model: SensorModel,
-    scales: tuple[float, ...],
-    crowded: bool,
+    probe: RawCentroids, skies: Skies, model: SensorModel, scales: tuple[float, ...], crowded: bool
 ) -> list[_Attempt]:
     """Return the attempts, the likeliest first, and all quick ones before the thorough ones.
 
@@ -359,11 +354,7 @@ def _attempts(
 
 
 def _models(
-    probe: RawCentroids,
-    skies: Skies,
-    model: SensorModel,
-    scales: tuple[float, ...],
-    crowded: bool,
+    probe: RawCentroids, skies: Skies, model: SensorModel, scales: tuple[float, ...], crowded: bool
 ) -> Iterator[SensorModel]:
     """Yield models to try, the likeliest first."""
     flux = bool(np.isfinite(probe.instrumental_mag).any())
@@ -389,13 +380,13 @@ def _likeliest_scale(
 ) -> tuple[SensorModel, list[Solution | None]]:
     """Return the model with the scale that explains the solved frames best, and the solutions with
     it."""
-    best, most, chosen = model, -np.inf, solutions
+    best, best_evidence, chosen = model, -np.inf, solutions
     for scale in dict.fromkeys((model.scale, *scales)):
         frames = centroids.frames(scale, model.use_flux).each()
         again = rematch(frames, solutions, skies.sky(model.limit), model.matching)
         evidence = sum(s.evidence for s in again if s is not None)
-        if any(again) and evidence > most:
-            best, most, chosen = model._replace(scale=scale), evidence, again
+        if any(again) and evidence > best_evidence:
+            best, best_evidence, chosen = model._replace(scale=scale), evidence, again
     return best, chosen
 
 
@@ -405,8 +396,8 @@ def _likeliest_scale(
 def _with_floor(
     frames: FrameSample, probe: _Probe, skies: Skies, model: SensorModel
 ) -> tuple[FrameSample, SensorModel, float]:
-    """Return the frames with an error added in quadrature to the stated ones, the model, and that
-    error [px]; 0 where none is needed."""
+    """Return the frames and the model with an error added in quadrature to the stated ones, and
+    that error [px]; 0 where it is not needed."""
     floor_px = likeliest_floor(
         frames.take(probe.rows).centroids, probe.solutions, skies.sky(model.limit), model.matching,
         model.scale,
@@ -469,7 +460,7 @@ def _with_true_scale(
             frames.t_s, frames.scaled(model), solutions, skies.sky(model.limit), model.matching
         )
         if again.solved[solutions.solved].all():
-            solutions, status = again, _open_status(status, again)
+            solutions, status = again, _status_now(status, again)
             residuals = scale_of(solutions.star, solutions.chi2, int(solutions.solved.sum()))
         else:
             solutions = solutions.rescaled(residuals.scale)

@@ -6,6 +6,7 @@
 """
 
 from collections.abc import Callable
+from dataclasses import dataclass
 from functools import partial
 from typing import NamedTuple
 
@@ -53,9 +54,9 @@ from epipole.tasks.algorithms.star_identification.star_pairs import PairTable
 # max(MAX_SKIPPED, n SKIPPED_SHARE) skipped frames of the n since the last success. The backward
 # pass retries them. With a hopeless sensor, the first failure counts as PATIENCE + 2 failures.
 PATIENCE, MAX_SKIPPED, SKIPPED_SHARE = 6, 32, 1 / 32
-MAX_BACKOFF_LOG2 = 20  # keeps the power of two an integer of usual size
-# Factor on the error of an earlier solution that serves as a prior: it had other errors or another
-# sky.
+MAX_BACKOFF_LOG2 = 20  # limit of the exponent: the power stays a small integer
+# Factor on the error of an earlier solution that serves as a prior: it was found with other errors
+# or another sky.
 PRIOR_SIGMAS = 3.0
 NO_CENTROIDS = 5
 STATUS = {
@@ -161,7 +162,7 @@ def identify_sample(
     share
         Of what is left of the sensor's budget, what this pass may cost.
     one_will_do
-        One identified frame is enough: the first ones may cost all of that.
+        One identified frame is enough: the first frames may cost all of the share.
     """
     if not len(sample.t_s):
         return unsolved(sample.centroids.first), []
@@ -221,48 +222,25 @@ def identify_sequence(
     """
     n = len(frames.beta)
     solutions, status = unsolved(frames.first), np.zeros(n, np.int8)
-    arrays, rule = _arrays(t_s, frames), rule_of(matching, sky)
     stars = StarDirections(sky.catalogue.u_icrs, sky.catalogue.magnitude)
+    arrays, rule = _arrays(t_s, frames), rule_of(matching, sky)
     sequence = _Sequence(frames, arrays, stars, rule, solutions, status)
-    forth, back, none = FrameRange(0, n, 1, False), FrameRange(n - 1, -1, -1, False), no_priors(n)
-
-    crowd_first = False
-
-    def search(k: int, failures: int, step: int) -> Searched | None:
-        nonlocal crowd_first
-        # Crowded frames take long. Where the stars' brightness is unknown, they are tried after 0,
-        # 1, 2, 4, 8 ... failures only.
-        often = not np.isnan(matching.zero_point_mag)
-        tried = matching._replace(
-            crowded=matching.crowded and (often or failures.bit_count() <= 1),
-            starlit=sequence.starlit(k, step),
-            crowd_first=crowd_first,
-        )
-        if allowance is not None:
-            done = (k + 1 if step > 0 else n - k) / n
-            tried = tried._replace(budget_s=allowance.left_s(k, done))
-            if tried.budget_s < TOO_LITTLE_S:
-                return None
-        found = search_frame(frames.frame(k), sky, grid, pairs(), tried)
-        if allowance is not None:
-            allowance.spend(k, found.cost_s)
-        if found.solution is not None:
-            crowd_first = found.as_crowd
-        return found
-
+    search = _SkySearch(sequence, sky, grid, pairs, matching, allowance)
+    forward, backward = FrameRange(0, n, 1, False), FrameRange(n - 1, -1, -1, False)
+    none = no_priors(n)
     if anchored:
-        sequence.follow(forth, priors)
-        sequence.follow(back, none)
+        sequence.follow(forward, priors)
+        sequence.follow(backward, none)
     if not solutions.solved.all():
         hopeless &= n > MAX_SKIPPED
-        sequence.follow_and_search(forth, priors, search, PATIENCE + 1 if hopeless else 0)
+        sequence.follow_and_search(forward, priors, search, PATIENCE + 1 if hopeless else 0)
     if solutions.solved.any() and not solutions.solved.all():
-        # Backward, without priors: those were tried on the way forward. What lies behind a slew
-        # and was skipped is searched.
+        # Backward, without priors, which were tried forward. Frames that were skipped beyond a slew
+        # are searched now.
         before = solutions.solved.sum()
-        sequence.follow_and_search(back, none, search, 0)
+        sequence.follow_and_search(backward, none, search, 0)
         if solutions.solved.sum() > before:
-            sequence.follow(forth, none)
+            sequence.follow(forward, none)
     status[np.diff(frames.first) == 0] = NO_CENTROIDS
     return solutions, [STATUS.get(code) for code in status.tolist()]
 
@@ -284,7 +262,7 @@ def identify_again(
 
 
 class _Sequence(NamedTuple):
-    """A pass through the frames; solutions and status are changed."""
+    """A sensor's frames with their solutions and status, which its methods change."""
 
     frames: SensorCentroids
     arrays: FrameArrays
@@ -353,6 +331,43 @@ class _Sequence(NamedTuple):
         before = self.solutions.solved[:k][::-1] if step > 0 else self.solutions.solved[k + 1 :]
         solved = np.flatnonzero(before)
         return int(solved[0]) if len(solved) else len(before)
+
+
+@dataclass
+class _SkySearch:
+    """Searches single frames over the whole sky; see `identify_sequence` for its fields."""
+
+    sequence: _Sequence
+    sky: Sky
+    grid: SkyGrid
+    pairs: Callable[[], PairTable]
+    matching: MatchSettings
+    allowance: Allowance | None
+    crowd_first: bool = False  # the frame that was found last was a crowd
+
+    def __call__(self, k: int, failures: int, step: int) -> Searched | None:
+        """Return the result for frame k; None where the budget leaves too little."""
+        frames, matching = self.sequence.frames, self.matching
+        # A search in a crowd takes long. Without a known brightness of the stars, it is tried only
+        # after 0, 1, 2, 4, 8 ... failures.
+        has_zero_point = not np.isnan(matching.zero_point_mag)
+        tried = matching._replace(
+            crowded=matching.crowded and (has_zero_point or failures.bit_count() <= 1),
+            starlit=self.sequence.starlit(k, step),
+            crowd_first=self.crowd_first,
+        )
+        if self.allowance is not None:
+            n = len(frames.beta)
+            share_done = (k + 1 if step > 0 else n - k) / n
+            tried = tried._replace(budget_s=self.allowance.left_s(k, share_done))
+            if tried.budget_s < TOO_LITTLE_S:
+                return None
+        found = search_frame(frames.frame(k), self.sky, self.grid, self.pairs(), tried)
+        if self.allowance is not None:
+            self.allowance.spend(k, found.cost_s)
+        if found.solution is not None:
+            self.crowd_first = found.as_crowd
+        return found
 
 
 def _skipped(failures: int, frames: int) -> int:

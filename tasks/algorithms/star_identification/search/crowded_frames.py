@@ -2,9 +2,8 @@
 
 As in `votes`, one centroid, the pivot, is taken for one star after the other, and the centroids
 about it, its companions, vote for the roll of the image. Few centroids of a crowd are stars.
-Therefore many pivots are tried, each quickly. Only the near companions of a pivot vote: the share
-of stars among them is that among all, and the sky has fewer pairs with such a small separation. For
-each pivot:
+Therefore many pivots are tried, each quickly. Only the near companions of a pivot vote: their share
+of stars is that of all, and the sky has fewer pairs with such a small separation. For each pivot:
 
 1. Each star that the pivot may be has near neighbours on the sky. A companion as far from the pivot
    as a neighbour is from the star votes for the roll that turns the one upon the other.
@@ -239,8 +238,8 @@ def _vote_with_most_agreeing(n, at_bin, votes):
 
 @borrowing_kernel
 def _farthest_agreeing_vote(n, k, near, votes):
-    """Return the vote with the farthest neighbour, of the first n votes those that agree with vote
-    k, and how many votes agree with it. It determines the roll best."""
+    """Return the vote with the farthest neighbour, which determines the roll best, of those of the
+    first n that agree with vote k; and how many votes agree with it."""
     best, agreed = k, 0
     for m in range(n):
         if _agree(k, m, votes) and near.chord[votes.entry[m]] > near.chord[votes.entry[best]]:

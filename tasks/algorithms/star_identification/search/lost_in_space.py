@@ -9,9 +9,9 @@ Hypotheses are pairs of centroids taken for pairs of stars, from the table of ca
    (`votes`); the hypotheses with most votes are tried on all centroids (`pair_hypotheses`). A
    second round takes all pivots and companions, and tries more hypotheses.
 
-The search ends as soon as an attitude is beyond doubt, or when too few pivots are left for one that
-would be. The amount of work is counted and bounded, so that a search takes bounded time and gives
-the same answer on every machine.
+The search ends as soon as an attitude is clear, or when too few pivots are left for a clear one.
+The work is counted and bounded, so that a search takes bounded time and gives the same answer on
+every machine.
 """
 
 import math
@@ -62,7 +62,7 @@ from epipole.tasks.algorithms.symmetric_matrices import invert_symmetric
 # Number of brightest centroids that are paired, and of the brightest stars of an average field that
 # they may be.
 N_BRIGHTEST, BRIGHT_STARS = 5, 6.0
-# Log odds below which a hypothesis is dropped: three misses, ln 0.5 each. The votes find it then.
+# Log odds below which a hypothesis is dropped: three misses, ln 0.5 each. Votes may still find it.
 DROP_EARLY_LOG_ODDS = -1.8
 
 

@@ -24,7 +24,7 @@ from epipole.tasks.algorithms.star_identification.star_grid import find_in_cone
 CLEARLY_BETTER = 6.0
 N_NUDGED = 12  # brightest centroids onto which a predicted star is moved
 MAX_COMPARED = 100_000_000  # pairs of all tries for this; most are far apart: about 10 ms
-MAX_MAG_ERROR = 2.5  # a match whose brightness is farther off is a coincidence
+MAX_MAG_ERROR = 2.5  # [mag] a match whose brightness is farther off is false
 
 
 class Centroids(NamedTuple):
@@ -215,8 +215,8 @@ def _drop_odd(star_of, instrumental, magnitude, zero_point):
     """Take the star from centroids whose magnitude differs from it by more than `MAX_MAG_ERROR`.
 
     `star_of` (n,) is changed to -1 there. `instrumental` (n,) are magnitudes of the centroids, NaN
-    where unknown, `magnitude` (m,) those of the stars, and `zero_point` what is between them; with
-    NaN nothing changes.
+    where unknown, `magnitude` (m,) those of the stars, `zero_point` the latter minus the former;
+    with NaN nothing changes.
     """
     if math.isnan(zero_point):
         return
@@ -385,7 +385,7 @@ def solve_predicted(predicted, lost, centroids, stars, box, rule, solution, matc
         The prediction.
     lost : bool
         The attitude was searched over the whole sky: then its covariance only says how far to
-        look, and the evidence is charged with every attitude there is.
+        look, and the prior of the evidence is uniform over all attitudes.
     centroids : Centroids
         The frame's centroids.
     stars : StarDirections

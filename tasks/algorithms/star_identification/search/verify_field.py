@@ -21,7 +21,7 @@ from epipole.tasks.algorithms.star_identification.star_grid import cell_at, cell
 CELLS = 32  # along each side of the image
 DETECTED_SHARE = 0.4  # of the stars in an image that are among the centroids, at least
 GATE = 3.0  # [sigma] of a star's predicted position
-LOOK_UPS = 100  # units of work of a field, beside one per star
+LOOK_UPS = 100  # units of work per field, in addition to one per star
 
 
 class CentroidCells(NamedTuple):
@@ -120,8 +120,8 @@ def field_log_odds(problem, i, s, j, other, c, stars, cells, scratch):
     pair = Pair(x, y, noise2, c, math.pi * GATE * GATE * len(u) / problem.image.area)
     # Cosine of the angle between boresight and corner.
     least = 1.0 / math.sqrt(1.0 + max(-box[0], box[1]) ** 2 + max(-box[2], box[3]) ** 2)
-    # The two stars of the pair have centroids in any case: they tell nothing. Their ratios, which
-    # the loop below includes, are divided out first.
+    # The two stars of the pair have centroids by construction. Their ratios, which the loop below
+    # includes, are divided out first.
     odds = -2.0 * math.log(DETECTED_SHARE / min(pair.density * 2.0 * noise2, 0.5 * DETECTED_SHARE))
     x, y, z = R[2, 0], R[2, 1], R[2, 2]
     cone, ratio, looked = cells_of_cone(x, y, z, least), 1.0, 0
@@ -151,7 +151,7 @@ def _ratio_of_star(star, z, R, box, pair, cells):
     # Error of the predicted position: it grows with the distance from the pair, over its length.
     s2 = pair.noise2 * (1.5 + 2.0 * d2 / (pair.c * pair.c)) + MAX_BETA * MAX_BETA * d2
     chance = pair.density * s2
-    if chance > 0.5 * DETECTED_SHARE:  # with or without a centroid, it tells nothing
+    if chance > 0.5 * DETECTED_SHARE:  # a centroid there is no evidence
         return 1.0
     if _has_centroid(x, y, GATE * math.sqrt(s2), cells):
         return DETECTED_SHARE / chance

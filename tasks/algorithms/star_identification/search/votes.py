@@ -259,8 +259,8 @@ def make_refined_votes():
 def gather_votes(problem, i, n_companions, coarse, votes, min_votes, refined):
     """Write pivot i's votes in cells with at least `min_votes` to `refined` (compiled).
 
-    Only the cell in the middle of a vote's tolerance counts. With all cells that it touches, none
-    of 10,000 frames more is identified, and a frame in a hundred takes a third longer.
+    Only the cell in the middle of a vote's tolerance counts. With all cells that it touches, no
+    more of 10,000 frames are identified, and a frame in a hundred takes a third longer.
 
     Returns
     -------
