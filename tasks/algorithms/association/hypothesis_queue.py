@@ -1,4 +1,4 @@
-"""Hypotheses, the likeliest first, and those that share tracklets with a given one."""
+"""A queue of hypotheses, the likeliest first, that finds those that contradict a given one."""
 
 import heapq
 from collections import defaultdict
@@ -42,7 +42,7 @@ class HypothesisQueue:
             self._by_tracklet[i].append(h)
 
     def pop(self) -> Hypothesis | None:
-        """Remove the likeliest hypothesis, None if empty. It stays a rival of the others."""
+        """Remove and return the likeliest hypothesis, None if empty. It stays a rival of others."""
         return heapq.heappop(self._heap)[3] if self._heap else None
 
     def sharing(self, h: Hypothesis) -> list[Hypothesis]:

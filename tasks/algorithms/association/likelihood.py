@@ -60,7 +60,7 @@ from epipole.tasks.algorithms.constants import EARTH_RADIUS_KM
 
 PRIOR_DETECTION = 0.9  # probability of detection before the data are known
 FEW_SENSORS = 6  # up to this number, every pair of sensors provides seeds
-# With more sensors they save time in crowds. Gate of seeds: other pairs seed the objects that it
+# Gate of seeds with more sensors: it saves time in crowds, and other pairs seed the objects that it
 # rejects. With 1.25 the odds change, with 5 nothing does.
 SEED_SIGMA = 2.5
 # Maximum expected number of objects without a seed, and log-odds at which a group is accepted
@@ -162,7 +162,7 @@ class _Search:
         self.many = len(space.views.half_field) > FEW_SENSORS
         self.sparse = sparse_sensors(space.views)
         self.group, self.ambiguous = np.full(len(order), FREE), np.zeros(len(order), np.bool_)
-        self.fits_another = np.zeros(len(order), np.bool_)  # a hypothesis has the tracklet
+        self.in_hypothesis = np.zeros(len(order), np.bool_)  # the tracklet was in any hypothesis
         self.groups: list[Hypothesis] = []
 
     def run(self, pairs: EveryPair | SensorPairs, min_log_odds: float) -> Groups:
@@ -186,7 +186,7 @@ class _Search:
         group, ambiguous = np.empty_like(self.group), np.empty_like(self.ambiguous)
         free, undecided = self.group == FREE, np.empty_like(self.ambiguous)
         group[self.order], ambiguous[self.order] = self.group, self.ambiguous & free
-        undecided[self.order] = self.fits_another & free & ~self.ambiguous
+        undecided[self.order] = self.in_hypothesis & free & ~self.ambiguous
         return Groups(group, scores, ambiguous, undecided, self.space.chance.detected)
 
     def _enough_pairs(self) -> float:
@@ -198,7 +198,7 @@ class _Search:
         return float(np.ceil(np.log(MAX_UNSEEDED / max(len(self.groups), 1)) / np.log(missed)))
 
     def _take_leftover(self, pairs: RankedPairs) -> None:
-        """Accept groups of tracklets that are left, of pairs of sensors that were skipped."""
+        """Accept groups of the tracklets that are left, from pairs of sensors that were skipped."""
         seeds = leftover_seeds(self.space, pairs, self._enough_pairs(), self.space.gate_sigma)
         self.take(distinct(self.grow(seeds)[0]), MIN_KEPT_LOG_ODDS)
 
@@ -223,8 +223,8 @@ class _Search:
             return [], []
         min_score = MIN_KEPT_LOG_ODDS - self.margin
         grown = grow_all(self.space, self.work, seeds, float(clear), min_score)
-        self.fits_another[grown.member] = True
-        member, first, skip = (
+        self.in_hypothesis[grown.member] = True
+        member, first, first_missed = (
             values.tolist() for values in (grown.member, grown.first_member, grown.first_missed)
         )
         hypotheses = [
@@ -233,7 +233,7 @@ class _Search:
                 (a, b),
                 tuple(member[first[q] : first[q + 1]]),
                 grown.x_km[q],
-                grown.missed[skip[q] : skip[q + 1]],
+                grown.missed[first_missed[q] : first_missed[q + 1]],
             )
             for q, (score, (a, b)) in enumerate(
                 zip(grown.score.tolist(), seeds[grown.seed].tolist(), strict=True)
@@ -276,7 +276,7 @@ class _Search:
     def take(self, hypotheses: list[Hypothesis], min_log_odds: float) -> None:
         """Accept hypotheses, the likeliest first; members that a rival also has are ambiguous."""
         taken = self.space.taken
-        # Some may have lost tracklets to a clear group.
+        # A clear group may have taken some of their tracklets.
         broken = [h for h in hypotheses if taken[list(h.members)].any()]
         intact = [h for h in hypotheses if not taken[list(h.members)].any()]
         queue = HypothesisQueue(intact + self._grow_again(broken))
@@ -293,8 +293,8 @@ class _Search:
             rivals = queue.rivals(best, self.margin, self.group != FREE)
             kept = set(best.members).intersection(*(h.members for h in rivals))
             sensors = {int(self.space.views.sensor[i]) for i in kept}
-            # Only members that all rivals have too are beyond doubt. They are accepted if they are
-            # at least half of the hypothesis.
+            # Only members that all rivals have too are certain. They are accepted if they are at
+            # least half of the hypothesis.
             if len(sensors) >= 2 and 2 * len(kept) >= len(best.members):
                 self._accept(best, kept)
             else:
@@ -308,8 +308,8 @@ class _Search:
         return self.grow(np.array(seeds, np.int64).reshape(-1, 2))[0]
 
     def _free_seed(self, h: Hypothesis) -> list[tuple[int, int]]:
-        """Return two free members, of two sensors, from which a hypothesis can grow again: its seed
-        if that is free. Nothing if there are none."""
+        """Return a seed from which a hypothesis can grow again: its seed if free, or two free
+        members of two sensors. Empty if there are none."""
         taken, sensor = self.space.taken, self.space.views.sensor
         if not taken[list(h.seed)].any():
             return [h.seed]

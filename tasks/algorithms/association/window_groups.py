@@ -61,27 +61,27 @@ class WindowGroups:
         self._score = np.concatenate([self._score, groups.score])
 
     def clear(self, rows: Indices) -> None:
-        """Forget the groups of some items."""
+        """Remove some items from their groups, with what was decided of them."""
         self.group[rows] = FREE
         self.ambiguous[rows] = self.undecided[rows] = False
 
     def doubt(self, rows: Indices) -> None:
-        """Let the groups of some items be uncertain."""
+        """Mark the groups of some items as uncertain."""
         groups = self.group[rows]
         self._score[groups[groups != FREE]] = -np.inf
 
     def contradicted(self, compared: Flags, briefly_s: float) -> Indices:
-        """Return the items of groups of two tracklets that fit no object in another window.
+        """Return the items of groups of two tracklets that both fit no object in another window.
 
-        There both are seen for longer than `briefly_s` [s], and `compared` (n,) bool: not those of
-        sensors that are left out. Two sensors and two objects in nearly one plane may agree by far
-        in one half minute, and not at all in the next.
+        In that window both are seen for longer than `briefly_s` [s], and are `compared` (n,) bool:
+        their sensors are not left out. If two sensors and two objects are nearly in one plane,
+        wrong pairs may agree well in one half minute, and not at all in the next.
         """
         items = self.items
-        alone = (self.group == FREE) & ~self.undecided & ~self.ambiguous & compared
-        alone = np.flatnonzero(alone & (items.last_ns - items.first_ns > briefly_s * 1e9))
-        alone = alone[np.argsort(items.tracklet[alone], kind="stable")]
-        tracklet, window = items.tracklet[alone], items.window[alone]
+        unfit = (self.group == FREE) & ~self.undecided & ~self.ambiguous & compared
+        unfit = np.flatnonzero(unfit & (items.last_ns - items.first_ns > briefly_s * 1e9))
+        unfit = unfit[np.argsort(items.tracklet[unfit], kind="stable")]
+        tracklet, window = items.tracklet[unfit], items.window[unfit]
         pairs = self._pairs()
         begin = np.searchsorted(tracklet, items.tracklet[pairs])
         end = np.searchsorted(tracklet, items.tracklet[pairs], side="right")
@@ -99,15 +99,15 @@ class WindowGroups:
         return np.asarray(rows[first[size == 2][:, None] + np.arange(2)])
 
     def withdraw(self, rows: Indices) -> None:
-        """Let some items be undecided instead of in their group."""
+        """Remove some items from their groups, and mark them as undecided."""
         self.group[rows] = FREE
         self.undecided[rows] = True
 
     def continue_groups(self, allowed: Flags, briefly_s: float) -> None:
         """Let the tracklets of a group stay together in neighbouring windows.
 
-        They may reach into such a window for a few seconds only, too short to be found there again.
-        If none of them has a group there, the group goes on there:
+        They may be seen there for a few seconds only, too briefly to be grouped again. If none of
+        them has a group in the other window, the group continues there
 
         - if it is certain, and all of them are undecided there;
         - or if at most one of them is seen there for longer than `briefly_s` [s].
@@ -124,21 +124,21 @@ class WindowGroups:
             row = np.minimum(np.searchsorted(key, key[sources] + to_next), len(key) - 1)
             there = key[row] == key[sources] + to_next
             source, row = self.group[sources[there]], row[there]
-            pair = source * (items.window.max(initial=0) + 1) + items.window[row]
-            order = np.argsort(pair, kind="stable")
-            _, starts = np.unique(pair[order], return_index=True)
+            group_and_window = source * (items.window.max(initial=0) + 1) + items.window[row]
+            order = np.argsort(group_and_window, kind="stable")
+            _, starts = np.unique(group_and_window[order], return_index=True)
             for members in np.split(order, starts[1:]) if len(row) else []:
                 if ((self.group[row[members]] == FREE) & allowed[row[members]]).any():
                     self._continue(int(source[members[0]]), row[members], allowed, brief)
 
     def _continue(self, group: int, members: Indices, allowed: Flags, brief: Flags) -> None:
-        """Let a group go on in another window, where its tracklets are the items `members`."""
+        """Continue a group in another window, where its tracklets are the items `members`."""
         joined = np.unique(self.group[members][self.group[members] != FREE])
         free = members[(self.group[members] == FREE) & allowed[members]]
         if not len(joined):
             sure = self._score[group] >= CERTAIN_LOG_ODDS and self.undecided[free].all()
-            alone = len(np.unique(self.items.sensor[free])) < 2
-            if alone or len(free) < len(members) or not (sure or (~brief[free]).sum() <= 1):
+            of_one_sensor = len(np.unique(self.items.sensor[free])) < 2
+            if of_one_sensor or len(free) < len(members) or not (sure or (~brief[free]).sum() <= 1):
                 return
             joined = np.array([len(self._score)])
             self._score = np.append(self._score, self._score[group])
@@ -154,11 +154,11 @@ class WindowGroups:
         self.undecided[free] = self.ambiguous[free] = False
 
     def to_decide_again(self, rows: Indices, window_s: float) -> Indices:
-        """Return the items of a longer window to decide again; empty if that is useless.
+        """Return the items of a longer window to decide again; empty if of fewer than two sensors.
 
-        These are items of tracklets that last long enough in it, `MIN_LENGTH_RATIO` times the
-        last window, `window_s` [s]. A group is decided again as a whole or not at all: not if it is
-        certain, or if one of its tracklets is too short.
+        Their tracklets last long enough in it: `MIN_LENGTH_RATIO` times the last window, `window_s`
+        [s]. A group is decided again as a whole or not at all: not if it is certain, or if one of
+        its tracklets is too short.
         """
         items = self.items
         _, which = np.unique(items.tracklet[rows], return_inverse=True)
@@ -172,8 +172,8 @@ class WindowGroups:
         unfit[:-1] = self._score >= CERTAIN_LOG_ODDS
         unfit[group[~continues & (group != FREE)]] = True
         chosen = rows[continues & ~unfit[group]]  # FREE is -1: the last entry, never unfit
-        alone = len(np.unique(items.sensor[chosen])) < 2
-        return chosen[:0] if alone else chosen
+        of_one_sensor = len(np.unique(items.sensor[chosen])) < 2
+        return chosen[:0] if of_one_sensor else chosen
 
     def reconsider(self, rows: Indices, again: Indices, tracklet: Indices, groups: Groups) -> None:
         """Enter the groups of a longer window for those of its items that were decided `again`.
@@ -198,11 +198,11 @@ class WindowGroups:
                 joined.setdefault((window, base + new_group), group)
         if not joined:
             return
-        now = self.group[again].copy()
+        new = self.group[again].copy()
         for k, row in enumerate(again.tolist()):
             window = int(items.window[row])
-            group = joined.get((window, int(now[k])), FREE)
+            group = joined.get((window, int(new[k])), FREE)
             if group != FREE:
                 occupied = (window, group, int(items.sensor[row])) in taken
-                now[k] = FREE if occupied else group
-        self.group[again] = now
+                new[k] = FREE if occupied else group
+        self.group[again] = new

@@ -55,8 +55,9 @@ MAX_FAINT_MISSES = 8  # in a row; 3 of 100 chains of such objects have more
 # Least log-evidence of what a chain has behind a gap at which a track would end. A prediction over
 # a gap is wide, and a false alarm is soon within it; a burst of frames on an object adds more.
 MIN_BEHIND_GAP = 5.0
-MAX_FREE = 8.0  # free detections in a frame, up to which faint objects are searched for: with 10 it
-# would take 10 ms
+# Faint objects are searched for in frames with up to this number of free detections: with 10 it
+# would take 10 ms.
+MAX_FREE = 8.0
 N_RATES = 24  # classes of rate for which the maximum evidence is tabulated
 SLOWEST_RAD_S = 1e-6  # upper end of the slowest class of rate [rad/s]
 MAX_PAIRS = 500_000  # limit per frame, even in a short sequence
@@ -157,8 +158,8 @@ class _Chains(NamedTuple):
     """The strongest chain of each detection of the newest frame.
 
     length : (n,) int64, number of detections; 0: no chain
-    strength : (n,) float, log-evidence beyond the log of the number of pairs, less what the fluxes
-        take
+    strength : (n,) float, log-evidence beyond the log of the number of pairs, less the penalty of
+        unlike fluxes
     members : (n, longest) int64, detections, newest first
     """
 
@@ -295,16 +296,15 @@ def _extrapolate(u_f, u_g, chord2, ratio, out):
 
 @kernel
 def _chain_back(pair, detections, recent, rule, frames, best, wanted, scratch):
-    """Follow a pair back in time; return the number of detections, the log-evidence, and how much
-    the fluxes take from it.
+    """Follow a pair back in time; return the number of detections, the log-evidence, and the
+    penalty of unlike fluxes.
 
     Writes the detections, newest first, to `scratch.members`. The evidence is the log-likelihood
     ratio of one moving object against false alarms, over all detections but the first two; with
     `frames.faint`, of an object that is detected in most frames or in few, whichever is likelier.
-    What the fluxes take is not part of the evidence, it only ranks chains: an object of changing
-    brightness begins a track as soon as another. `frames` is the `_Evidence` of the pairs of both
-    frames, `best` its row for the pair's rate. The number is 0 if the evidence can no longer reach
-    `wanted`.
+    The penalty only ranks chains: an object of changing brightness begins a track as soon as
+    another. `frames` is the `_Evidence` of the pairs of both frames, `best` its row for the pair's
+    rate. The number is 0 if the evidence can no longer reach `wanted`.
     """
     f, j, g, i = pair.f, pair.j, pair.g, pair.i
     times, directions, variances = detections.times, detections.directions, detections.variances
@@ -317,6 +317,7 @@ def _chain_back(pair, detections, recent, rule, frames, best, wanted, scratch):
     learn_brightness(scratch.brightness, detections.log_flux[j])
     learn_brightness(scratch.brightness, detections.log_flux[i])
     n, at = 2, times[g]
+    # Log-evidence of an object that is detected in most frames, and of one in few.
     bright, dim = (f - g - 1) * LOG_MISS, -np.inf
     if frames.faint:
         dim = LOG_FAINT + (f - g - 1) * LOG_FAINT_MISS
@@ -325,7 +326,6 @@ def _chain_back(pair, detections, recent, rule, frames, best, wanted, scratch):
     misses, taken = 0, 0.0
     # The chain on this side of the last gap that it reached over: what lies behind is uncertain.
     n_near, evidence_near, taken_near = n, -np.inf, taken
-    # `bright` and `dim` are the log-evidence of an object that is detected in most frames, in few.
     for k in range(len(best) - 1):
         evidence = max(bright, dim)
         bright_after, dim_after = bright + misses * LOG_MISS, dim + misses * LOG_FAINT_MISS
@@ -353,7 +353,7 @@ def _chain_back(pair, detections, recent, rule, frames, best, wanted, scratch):
             continue
         area = 2 * np.pi * (P[0] + variances[m])
         gain = np.log(P_DETECTION / (frames.density[f - h] * area)) - 0.5 * chi2
-        # A detection that adds less than the misses before it take does not belong to the chain.
+        # A detection that adds less than the misses before it cost does not belong to the chain.
         if max(bright_after, dim_after + LOG_FAINT_HIT) + gain < evidence:
             misses += 1
             continue

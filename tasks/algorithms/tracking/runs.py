@@ -60,16 +60,16 @@ MAX_PAIRS_OF_ALL, MIN_PAIRS = 20_000_000, 5_000
 # Accepted number of false tracks in a sequence. It counts every pair of detections as a test. Most
 # pairs are too fast to reach the evidence, so that 1 to 5 % of this number are measured.
 FALSE_ALARM_SEQUENCE = 1.0
-# A track's motion and brightness are not yet known well at this number of detections: with 6 or 20
-# as many are mixed; without limit, what was right after a crossing is exchanged as well.
+# Up to this number of detections, a track's motion and brightness are not well known. With 6 or 20,
+# as many are mixed; without limit, right detections after a crossing are exchanged too.
 YOUNG = 10
 SHORT_SEQUENCE = 2  # a sequence is short up to twice the frames in which a track may begin
-# A track whose motion is known precisely goes on through more misses than `max_missed`: up to this
-# many frames, and while fewer false detections than this are expected in its gates.
+# A track with a precisely known motion continues through more misses than `max_missed`: up to this
+# number of frames, and while fewer false detections than this are expected in its gates.
 MAX_MISSED_FRAMES, MAX_STRAYS = 24, 3e-3
-# With the common motion removed, objects move by less than this share of its rate, or than this
-# rate [rad/s], 6 arcsec/s. Time is counted in units of the factor [s], so that the bounds of
-# acceleration are smaller by its square. From simulated geostationary objects at 10 and 30 s.
+# With the common motion removed, objects are slower than this share of its rate, or than this rate
+# [rad/s], 6 arcsec/s. Time is counted in units of the factor [s], which divides the bounds of
+# acceleration by its square. From simulated geostationary objects at 10 and 30 s.
 COMMON_SHARE, COMMON_RATE, COMMON_FACTOR = 0.3, 3e-5, 2.0
 
 
@@ -183,8 +183,8 @@ def follow_detections(
     motion = common_motion(*seen[:4], track)
     if motion is not None:
         moving = _follow_free(seen, _follow_in_motion(seen, rule, motion), rule)
-        # Confused tracks break: the better tracks hold more detections in fewer pieces.
-        track = max(track, moving, key=lambda tracks: _explained(tracks, rule.min_detections))
+        # Confused tracks break: better tracks have more detections in fewer pieces.
+        track = max(track, moving, key=lambda tracks: _n_explained(tracks, rule.min_detections))
     n_frames = int(np.count_nonzero(np.diff(seen.offsets)))
     if n_frames > SHORT_SEQUENCE * (rule.min_detections + EXTRA_DETECTIONS):
         return track
@@ -192,13 +192,13 @@ def follow_detections(
     return _follow_free(seen, track, rule._replace(min_evidence=-float(np.log(per_frame))))
 
 
-def _explained(track: Integers, min_detections: int) -> int:
-    """Return how many detections the tracks hold beyond the least that each must have."""
+def _n_explained(track: Integers, min_detections: int) -> int:
+    """Return the number of detections in tracks, beyond the minimum of each track."""
     return int(np.count_nonzero(track != NONE)) - min_detections * (int(track.max(initial=-1)) + 1)
 
 
 def _follow_in_motion(seen: SkyDetections, rule: TrackRule, motion: CommonMotion) -> Integers:
-    """Return the track number of every detection that moves as the common motion says."""
+    """Return the track number of every detection, -1 if it does not follow the common motion."""
     frame = np.repeat(np.arange(len(seen.time_s)), np.diff(seen.offsets))
     moving = seen._replace(
         time_s=seen.time_s / COMMON_FACTOR,
@@ -212,7 +212,7 @@ def _follow_in_motion(seen: SkyDetections, rule: TrackRule, motion: CommonMotion
 
 
 def _follow_free(seen: SkyDetections, track: Integers, rule: TrackRule) -> Integers:
-    """Return the tracks with those of the detections that have none; these come last."""
+    """Return the tracks, and after them new ones of the detections without a track."""
     free = np.flatnonzero(track == NONE)
     if not len(free):
         return track
@@ -242,7 +242,7 @@ def _follow_by_rule(seen: SkyDetections, rule: TrackRule) -> Integers:
 def _follow_and_retrace(detections, max_in_frame, rule):
     """Write each detection's track to `detections.track`; a frame has at most `max_in_frame`.
 
-    One kernel for Python: so both are compiled with it, also where no run retraces.
+    A single kernel is called from Python: so `_retrace` is compiled even if no run needs it.
     """
     if _follow(detections, max_in_frame, rule):
         _retrace(detections, max_in_frame, rule)

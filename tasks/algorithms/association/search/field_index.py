@@ -100,9 +100,9 @@ def _slot(keys, key):
 def _cells_per_km(radius_km, size):
     """Return the number of cells per kilometre at a distance from the Earth's centre.
 
-    At r Earth radii, the grid has lengths across the radius (1 + ln(r)) / r times as long as space,
-    along it 1 / r, which is less: the larger factor is returned. It also leads from a position to
-    that in the grid, in cells.
+    At r Earth radii, a length across the radius is (1 + ln(r)) / r times as long in the grid; one
+    along it 1 / r times, which is less. The larger factor is returned. A position times this factor
+    is its position in the grid, in cells.
     """
     r = radius_km / EARTH_RADIUS_KM
     return ((1.0 + np.log(r)) / r if r > 1.0 else 1.0) / (EARTH_RADIUS_KM * size)

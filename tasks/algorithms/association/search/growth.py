@@ -31,15 +31,15 @@ from epipole.tasks.algorithms.association.search.sight_lines import quantile
 from epipole.tasks.algorithms.association.views import error_sr, residual, residual_chi2
 from epipole.tasks.algorithms.kernels import borrowing_kernel, inlined_kernel, kernel
 
-# A seed is given up if the log-odds that the other sensors add are below the first number, and its
-# points are in the fields of at least the second number of them. With one sensor, or -2, small
-# scenes of bench_association come out with other odds; with six, or -8, they do not.
+# A seed is given up if the other sensors add less than these log-odds, and its points are in the
+# fields of at least this number of them. With one sensor, or -2, small scenes of bench_association
+# come out with other odds; with six, or -8, they do not.
 GIVE_UP_LOG_ODDS, MIN_LOOKS = -4.0, 3
 MIN_GAIN = 2.0  # minimum log-odds that a view adds to a well-known point, to join it
 MIN_LEAD = 5.0  # minimum difference of the log-odds of a sensor's best view and the next one
 MIN_REVIEWED = 4  # minimum number of views of a hypothesis that is reviewed
 WELL_KNOWN = 8  # number of views from which points are well known: choices need no review
-MIN_COMPLETENESS = 0.85  # minimum share of the expected detections, of a clear hypothesis
+MIN_COMPLETENESS = 0.85  # minimum share of the expected detections that a clear hypothesis has
 REVIEWS = 2  # with a single one, a false member may still distort the points
 DROPPED_TOGETHER = 64  # drop 1 + n // 64 of n members per pass
 

@@ -15,8 +15,8 @@ from epipole.tasks.algorithms.association.search.seeds import meet
 from epipole.tasks.algorithms.association.search.sight_lines import meeting_point
 from epipole.tasks.algorithms.kernels import borrowing_kernel, kernel
 
-# Maximum number of tracklets in no group, of a sensor that takes part. With 150, 20 sensors with
-# 100 false points each take 40 % longer, and find the same.
+# Maximum number of a sensor's tracklets in no group: with more, it takes no part. With 150, 20
+# sensors with 100 false points each take 40 % longer, and find the same.
 MAX_LEFT = 30
 
 
@@ -31,8 +31,8 @@ def leftover_seeds(space, pairs, enough, gate_sigma):
     pairs
         `RankedPairs`: tracklets of those that were skipped are compared.
     enough : float
-        Where this number of the pairs that have seeded should see the point, they would have found
-        it. A sensor that is much farther away than the two need not see it.
+        A point that this number of the pairs that have seeded should see needs no seed. A sensor
+        that is much farther away than the two need not see it.
     gate_sigma : float
         As in `seeds_between`.
     """

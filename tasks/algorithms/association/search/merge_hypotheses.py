@@ -47,28 +47,31 @@ def best_merger(
     `h`: those that are seen there did not fit when `h` grew.
 
     A fragment of a track adds little to the odds of an object that has the rest of the track. So
-    that they are of one track counts here. The merger's score may be below that of `h`.
+    the odds that both are fragments of one track count too. A merger may have a lower score than
+    `h`.
     """
     seen = space.views.seen
     solved = seen[list(h.members)].sum(axis=0) >= 2
     if solved.all():
         return None
-    best, likeliest, x_km = None, -np.inf, np.empty(3)
-    of_h: float | None = None
+    best, best_odds, x_km = None, -np.inf, np.empty(3)
+    odds_of_h: float | None = None
     tried = {h.members}
     for other in others:
-        more = [i for i in other.members if i not in h.members]
-        members = tuple(sorted({*h.members, *more}))
-        if not more or members in tried or space.taken[more].any() or seen[more][:, solved].any():
+        added = [i for i in other.members if i not in h.members]
+        members = tuple(sorted({*h.members, *added}))
+        if not added or members in tried or space.taken[added].any():
+            continue
+        if seen[added][:, solved].any():
             continue
         tried.add(members)
         value, fragments, n_missed = _weigh(space, work, np.array(members, np.int64), x_km)
-        if not value + fragments > likeliest:
+        if not value + fragments > best_odds:
             continue
         merger = Hypothesis(value, h.seed, members, x_km.copy(), work.missed[:n_missed].copy())
-        of_h = _with_fragments(space, work, h) if of_h is None else of_h
-        if value + fragments > max(of_h, _with_fragments(space, work, other)):
-            best, likeliest = merger, value + fragments
+        odds_of_h = _with_fragments(space, work, h) if odds_of_h is None else odds_of_h
+        if value + fragments > max(odds_of_h, _with_fragments(space, work, other)):
+            best, best_odds = merger, value + fragments
     return best
 
 

@@ -63,7 +63,7 @@ def resolve_conflicts(space, work, group, x_km):
         s = near[q, 0]
         groups_near[filled[s]] = near[q, 1]
         filled[s] += 1
-    for s in range(n_sensors):  # one sensor's tracklets fit into a processor's cache
+    for s in range(n_sensors):  # by sensor: its tracklets fit into a processor's cache
         for g in groups_near[first_near[s] : first_near[s + 1]]:
             if size[g] < MIN_TRACKLETS:
                 continue

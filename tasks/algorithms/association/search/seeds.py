@@ -70,7 +70,7 @@ def _size(views, s):
 def meet(space, i, j, m, gate_sigma, work):
     """Return whether two tracklets meet at all instants they share, of which m is the first.
 
-    `work` (2, 3) is work space: `axes` is written again for each instant.
+    `work` (2, 3) is work space; `seeds_between` passes `axes`, which it writes at each instant.
     """
     views, total, shared = space.views, 0.0, 0
     for h in range(len(views.time_s)):

@@ -48,7 +48,7 @@ MAX_OVERLAPPING = 64  # maximum number of others that a sensor is paired with, h
 MAX_TESTS = 512  # maximum number of tests per sensor of whether two fields overlap
 FEW_TRACKLETS = 8  # of a sensor in a window: seeding with no more costs next to nothing
 # Lines of sight pass near each other if their gap is within the sum of this angle, this distance,
-# and this number of sigmas: far more than those of one object miss by, and few others do.
+# and this number of sigmas. Lines to one object miss by far less; few other lines pass so near.
 PASSING_RAD, PASSING_KM, PASSING_SIGMA = 5e-3, 20.0, 5.0
 N_EDGES = 8  # outermost tracklets of a sensor, one for each of these directions on its plane
 
