@@ -40,13 +40,13 @@ KEY = ["epoch", "object_id", "sensor_id"]
 # were wrong, by 1.1 km and 0.34 s, were not judged: positions were 1.5 times as wrong as stated.
 MIN_OBJECTS = 2
 MAX_KNOWN_SIGMA_S = 1.0  # a clock with a larger sigma is unknown
-# Of low satellites: what a wrong clock shifts a sensor, and its objects, by.
+# Speed of low satellites: a wrong clock shifts a sensor and its objects by this times its offset.
 SPEED_KM_S = 7.6
-# Of low satellites. What is wrong along an orbit, or with the axes of a body, turns with it: a bias
-# that was found constant in inertial axes is left by this angle times its size.
+# Angular rate of low satellites. An error along the orbit, or of a body's axes, turns with it. If a
+# constant bias in inertial axes is taken off, this rate times the time, times its size, is left.
 TURN_RAD_S = 1.1e-3
-# Maximum of the errors with which a sensor at fault takes part: with larger ones its lines of sight
-# meet any others.
+# Maximum errors with which a sensor at fault takes part: with larger ones, its lines of sight meet
+# any others.
 MAX_ADDED_KM, MAX_ADDED_RAD = 10.0, 600 * ARCSEC
 
 
@@ -96,9 +96,9 @@ class SensorVerdict(NamedTuple):
     def fault(self) -> SensorFault | None:
         """Return the fault with which the sensor takes part.
 
-        Errors as large as the fault are per axis; only what is across a line of sight counts, on
-        two axes. A wrong clock moves each line by another amount: it is not taken off. None where
-        the kind of the fault is not known, it is too large, or corrected.
+        Its error per axis is the fault's size over sqrt(2): two axes across a line of sight count.
+        A wrong clock moves each line differently, so no bias is taken off. None if the fault is of
+        unknown kind, too large, or corrected.
         """
         if self.corrected:
             return None
@@ -138,7 +138,7 @@ class SensorVerdict(NamedTuple):
 class JudgedSights(NamedTuple):
     """The verdicts on those sensors that a night's lines of sight can judge.
 
-    `doubt` is what is wrong with sensors of which none can be named.
+    `doubt` is about faults that cannot be assigned to a sensor.
     """
 
     verdicts: list[SensorVerdict]
@@ -253,15 +253,15 @@ def sensor_verdicts(
     if not len(rows):
         return JudgedSights([])
     # A quantile: blends in a few tracklets are not an error of the attitude.
-    bias = rows.group_by("sensor_id").agg(
+    stated = rows.group_by("sensor_id").agg(
         pl.col("position_sigma_km").max(),
         attitude_sigma_rad=pl.col("attitude_rad2").quantile(0.9).sqrt(),
     ).sort("sensor_id")  # fmt: skip
     judged = judge_many_sensors(
-        _lines(rows, bias["sensor_id"]),
-        bias["position_sigma_km"].to_numpy(),
-        bias["attitude_sigma_rad"].to_numpy(),
-        np.array([guess.get(name, 0.0) for name in bias["sensor_id"]]),
+        _lines(rows, stated["sensor_id"]),
+        stated["position_sigma_km"].to_numpy(),
+        stated["attitude_sigma_rad"].to_numpy(),
+        np.array([guess.get(name, 0.0) for name in stated["sensor_id"]]),
     )
     drift = TURN_RAD_S / math.sqrt(12.0) * _seconds(rows)
     left = np.hypot(judged.bias_sigma, judged.size * np.minimum(drift, 1.0))
@@ -273,14 +273,14 @@ def sensor_verdicts(
             cause,
             float(size),
             float(size_sigma),
-            (float(off[0]), float(off[1]), float(off[2])),
-            float(off_sigma),
+            (float(bias[0]), float(bias[1]), float(bias[2])),
+            float(bias_sigma),
         )
-        for name, offset, sigma, cause, size, size_sigma, off, off_sigma in zip(
-            bias["sensor_id"], *judged[:6], left, strict=True
+        for name, offset, sigma, cause, size, size_sigma, bias, bias_sigma in zip(
+            stated["sensor_id"], *judged[:6], left, strict=True
         )
     ]
-    known = [one for one in verdicts if one.sigma_s < MAX_KNOWN_SIGMA_S or one.is_faulty]
+    known = [v for v in verdicts if v.sigma_s < MAX_KNOWN_SIGMA_S or v.is_faulty]
     return JudgedSights(known, judged.doubt)
 
 
@@ -346,10 +346,10 @@ def _lines(rows: pl.DataFrame, sensors: pl.Series) -> Lines:
 
 
 def _error_of_frames(rows: pl.DataFrame) -> Array:
-    """Return the noise, with what lines of the same frames share as independent errors [rad^2].
+    """Return the noise, enlarged because lines share frames: as independent errors [rad^2].
 
     Lines of a sensor at an epoch share the noise of its attitude. Lines of a tracklet at nearby
-    epochs are fitted to the same detections: if each is in n of the fits, their mean is as wrong
+    epochs are fitted to the same detections: if each detection is in n fits, their mean is as wrong
     as if each line had an independent error of n times its variance.
     """
     at_epoch = rows.select(pl.len().over("sensor_id", "epoch")).to_series().to_numpy()
@@ -358,7 +358,7 @@ def _error_of_frames(rows: pl.DataFrame) -> Array:
 
 
 def _fits_per_detection(rows: pl.DataFrame) -> Array:
-    """Return in how many lines of a tracklet the detections of each line are fitted: (n,)."""
+    """Return (n,): the mean number of lines of a tracklet to which a line's detections belong."""
     tracklet = rows.select(pl.struct("sensor_id", "tracklet_id").rank("dense")).to_series()
     start = rows["first_fitted"].min()
     # A tracklet's rank and a time, in microseconds, are one integer: no night, with what was read
@@ -379,9 +379,9 @@ def _fits_per_detection(rows: pl.DataFrame) -> Array:
 def _error_of_parts(rows: pl.DataFrame) -> Array:
     """Return what all lines in a part of a sensor's field share, as independent errors [rad^2].
 
-    It is the bias but for that of the attitude: of fitted optics, which differs from part to part,
-    and of neighbours' light. The mean of n lines with a shared error is as wrong as if each had an
-    independent one of n times its variance.
+    That is the bias without that of the attitude: of the fitted optics, which differs from part to
+    part, and of neighbours' light. The mean of n lines with a shared error is as wrong as if each
+    had an independent error of n times its variance.
     """
     shared = _direction_cov(rows, "bias")
     whole = np.trace(shared, axis1=1, axis2=2) / 2
@@ -397,19 +397,19 @@ def _direction_cov(rows: pl.DataFrame, which: str) -> Array:
 def add_faults(
     before: Sequence[SensorVerdict], now: Sequence[SensorVerdict]
 ) -> list[SensorVerdict]:
-    """Return the verdicts on logs, of `now` on what is left of them without the faults `before`.
+    """Return the verdicts on the logs: faults found `before`, plus those found `now` without them.
 
     A sensor with another kind of fault than before disagrees.
     """
-    known = {one.sensor_id: one for one in before if one.is_faulty}
-    total = {one.sensor_id: one for one in (*before, *now)} | known
-    for one in now:
-        was = known.get(one.sensor_id)
-        if one.is_faulty and was is not None and not was.is_still_wrong:
-            bias = np.add(was.bias, one.bias).tolist()
-            total[one.sensor_id] = was._replace(
-                cause=was.cause if one.cause == was.cause else DISAGREES,
-                offset_s=was.offset_s + one.offset_s,
+    known = {verdict.sensor_id: verdict for verdict in before if verdict.is_faulty}
+    total = {verdict.sensor_id: verdict for verdict in (*before, *now)} | known
+    for verdict in now:
+        was = known.get(verdict.sensor_id)
+        if verdict.is_faulty and was is not None and not was.is_still_wrong:
+            bias = np.add(was.bias, verdict.bias).tolist()
+            total[verdict.sensor_id] = was._replace(
+                cause=was.cause if verdict.cause == was.cause else DISAGREES,
+                offset_s=was.offset_s + verdict.offset_s,
                 size=math.hypot(*bias),
                 bias=(bias[0], bias[1], bias[2]),
             )
@@ -420,21 +420,14 @@ def add_corrections(
     before: Sequence[SensorVerdict], now: Sequence[SensorVerdict]
 ) -> list[SensorVerdict]:
     """Return the verdicts with clock offsets as in the logs: corrections so far plus the rest."""
-    corrected = {verdict.sensor_id: verdict for verdict in before if verdict.has_wrong_clock}
-    total = [
-        verdict._replace(
-            offset_s=verdict.offset_s + corrected[verdict.sensor_id].offset_s,
-            cause=verdict.cause or CLOCK,
-            corrected=True,
-        )
-        if verdict.sensor_id in corrected
-        else verdict
-        for verdict in now
-    ]
-    judged = {verdict.sensor_id for verdict in now}
-    total += [
-        verdict._replace(corrected=True)
-        for name, verdict in corrected.items()
-        if name not in judged
-    ]
-    return sorted(total)
+    total = {v.sensor_id: v._replace(corrected=True) for v in before if v.has_wrong_clock}
+    for verdict in now:
+        corrected = total.get(verdict.sensor_id)
+        if corrected is not None:
+            verdict = verdict._replace(
+                offset_s=verdict.offset_s + corrected.offset_s,
+                cause=verdict.cause or CLOCK,
+                corrected=True,
+            )
+        total[verdict.sensor_id] = verdict
+    return sorted(total.values())

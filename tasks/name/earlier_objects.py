@@ -1,7 +1,7 @@
 """Earlier objects: the ids that unknown objects had in nights before, by their orbits.
 
 The last orbit of an earlier object is moved to the orbits of the night, under the forces that
-orbits are fitted with. An object without an orbit is there with its last state.
+orbits are fitted with. For an object without an orbit, its last state is moved.
 """
 
 from collections.abc import Sequence
@@ -37,7 +37,7 @@ from epipole.tasks.common.orbit_forces import (
 
 HOUR_S = 3600.0
 MAX_SIGMA_KM = 100.0  # of a position: vaguer orbits are not moved over hours
-# Farther from the moved orbit an object is another one; vaguer orbits recognise none.
+# Farther from the moved orbit it is another object. An orbit with larger errors recognises nothing.
 NEAR_KM = 1500.0
 # What the forces neglect, in position along each axis [km] per day: some 0.3 by the rest of the
 # Earth's field. Estimated, so that it holds for objects that follow SGP4: six of seven true pairs
@@ -114,7 +114,7 @@ def _motions(
         pl.all_horizontal(pl.col(*_STATE, *_COVARIANCE).is_finite()),
         pl.sum_horizontal("cov_xx", "cov_yy", "cov_zz") < MAX_SIGMA_KM**2,
     )
-    # Of one night an orbit before a state: it is of all that the night saw.
+    # Of one night, the orbit is preferred to the state: it is fitted to all observations.
     date, is_state = pl.col("epoch").dt.date(), pl.col("forces") == ""
     if keep == "last":
         rows = rows.sort(date, ~is_state, "epoch")
@@ -132,9 +132,9 @@ def _observed(rows: pl.DataFrame) -> ObservedMotions:
 
 
 class _Mover:
-    """Moves the first n of some motions by the forces of orbits, to the epochs of the others.
+    """Moves the first n of m motions to the epochs of the others, by the forces of orbits.
 
-    `near` (m, m) says which of the others each may be.
+    `near` (m, m): motion i, moved, is within `NEAR_KM` of motion j.
     """
 
     def __init__(self, rows: pl.DataFrame, motions: ObservedMotions, n: int) -> None:
@@ -182,7 +182,7 @@ class _Mover:
 def _areas(state: Array, forces: str) -> tuple[list[float], list[float]]:
     """Return the mean and sigma of the areas over mass in sunlight and in the air [m^2/kg].
 
-    A short arc does not show them, but hours do: then they are as usual.
+    Those that `forces` does not have, as the arc was too short to show them, are the usual ones.
     """
     named = areas_in(forces)
     usual = [SUNLIT_AREA, (0.0, 0.0)] if is_sunlit(state) else [(0.0, 0.0), AIR_AREA]
@@ -191,7 +191,7 @@ def _areas(state: Array, forces: str) -> tuple[list[float], list[float]]:
 
 
 def _neglected(state: Array, dt_s: float) -> Array:
-    """Return the covariance (6, 6) of what the forces neglect in a time."""
+    """Return the covariance (6, 6) [km, km/s] of the neglected forces after a time [s]."""
     sigma_km = NEGLECTED_KM_PER_DAY * dt_s / DAY_S
     motion = np.sqrt(GM_KM3_S2 / np.linalg.norm(state[:3]) ** 3)
     return np.diag(np.repeat([sigma_km, motion * sigma_km], 3) ** 2)

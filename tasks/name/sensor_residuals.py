@@ -1,7 +1,7 @@
 """Sensor residuals: how far a sensor's detections of known objects are from their predictions.
 
-A clock that is late moves all objects back along their tracks, an ephemeris that is off moves them
-together. No other sensor is needed for it, so it also shows what all sensors have in common.
+A late clock moves all objects back along their tracks; a wrong ephemeris moves them together. This
+needs no other sensor, so it also shows an error that all sensors share.
 """
 
 from collections.abc import Mapping
@@ -29,8 +29,8 @@ AXES = ("along", "across")
 class SensorResidual:
     """Observed minus predicted position of a sensor's known objects, at their distance [km].
 
-    Mean and scatter are over the objects, each by the mean of its detections. One object has no
-    scatter: NaN.
+    Mean and scatter are over the objects, of the means over their detections. The scatter of a
+    single object is NaN.
     """
 
     sensor_id: str

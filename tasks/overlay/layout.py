@@ -10,7 +10,7 @@ from epipole.tasks.overlay.messages import LEFT_OUT, OBJECTS
 from epipole.tasks.overlay.scene import ROOT_FRAME
 
 MAX_IMAGES = 4  # more are too small to see a centroid
-# From where the scene is seen at first, and what is drawn [m]: the geostationary ring fits.
+# Distance of the viewer at first, and range that is drawn [m]: the geostationary ring fits.
 DISTANCE_M, NEAR_M, FAR_M = 1.2e8, 1e4, 1e9
 
 
@@ -54,7 +54,7 @@ def _scene() -> dict[str, Any]:
 
 
 def _stacked(panels: Sequence[str]) -> Any:
-    """Return panels one below the other, of one height."""
+    """Return panels below each other, all of the same height."""
     if len(panels) < 2:
         return panels[0] if panels else None
     return _divided(panels[0], _stacked(panels[1:]), "column", 100 / len(panels))

@@ -1,7 +1,7 @@
 """How all pictures look, and how they become SVG or PNG.
 
 matplotlib's objects are used without pyplot, which keeps a list of figures for the whole process.
-Its options are of the process too: they are set only while a picture is drawn, by one thread.
+Its options are global too: they are set only while a picture is drawn, by one thread at a time.
 """
 
 import contextlib
@@ -45,7 +45,7 @@ LINES = (
     (BLUE, "o", "-"), (VERMILLION, "s", "--"), (GREEN, "^", "-."), (PURPLE, "D", ":"),
     (ORANGE, "v", "-"), (SKY, "P", "--"), (BLACK, "X", "-."), (GREY, "*", ":"),
 )  # fmt: skip
-WIDTH_IN = 3.7  # a phone is so wide: text in a picture is as large as beside it
+WIDTH_IN = 3.7  # of a phone: text in a picture is as large there as beside it
 LONGEST_NAME, LONGEST_TEXT = 18, 300
 _OPTIONS: dict[Any, Any] = {
     "axes.edgecolor": GREY,
@@ -75,9 +75,9 @@ _OPTIONS: dict[Any, Any] = {
     "ytick.major.width": 0.6,
 }
 _NO_TIMES = {"Date": None, "Creator": None, "Format": None, "Type": None}
-_ALONE = threading.Lock()
+_DRAWING = threading.Lock()
 PNG_DPI = 110
-_LONG_NUMBER = re.compile(r"-?\d+\.\d{3,}")  # a hundredth of a point is seen by nobody
+_LONG_NUMBER = re.compile(r"-?\d+\.\d{3,}")  # nobody sees a hundredth of a point
 
 Draw = Callable[[Figure], None]
 
@@ -92,13 +92,13 @@ def as_svg(draw: Draw, height_in: float, width_in: float = WIDTH_IN) -> str:
     _for_page(root)
     zoomed = [axes for axes in figure.axes if (axes.get_gid() or "").startswith(_ZOOM)]
     if zoomed:
-        _tell_axes(root, figure, zoomed[0])
+        _describe_axes(root, figure, zoomed[0])
     made: str = ElementTree.tostring(root, encoding="unicode")
     return made
 
 
-# What page.js needs: dots with a text (`data-t`) and a link (`data-h`), what is data and what are
-# axes (classes), and the values at the sides of the axes.
+# For page.js: text (`data-t`) and link (`data-h`) of each dot, classes of data and of axes, and the
+# values at the sides of the axes.
 
 SVG, XLINK = "http://www.w3.org/2000/svg", "http://www.w3.org/1999/xlink"
 ElementTree.register_namespace("", SVG)
@@ -107,7 +107,7 @@ _HOVER, _ZOOM = "hover:", "zoom:"  # how the names of groups begin
 _CLASSES = {"matplotlib.axis_1": "xaxis", "matplotlib.axis_2": "yaxis"}
 _TICK = ("xtick_", "ytick_")
 _DATA = ("PathCollection_", "LineCollection_", "line2d_", "Quiver_", "text_", "data", _HOVER)
-_MARKS = ("PathCollection_", _HOVER)  # which keep their size
+_MARKS = ("PathCollection_", _HOVER)  # these keep their size when the page zooms
 # Colours of a picture follow those of the page, dark or light.
 COLOURS = {
     INK: "ink", GREY: "grey", PALE: "pale", "#e3e7ea": "grid", "#ffffff": "paper",
@@ -116,11 +116,11 @@ COLOURS = {
 }  # fmt: skip
 _VARIABLES = {colour.lower(): f"var(--{name})" for colour, name in COLOURS.items()}
 _COLOUR = re.compile(r"#[0-9a-f]{6}")
-_FONT = re.compile(r"font-family: [^;]*; ?")  # that of the page
+_FONT = re.compile(r"font-family: [^;]*; ?")  # removed: the page has its font
 
 
 def hover(artist: Artist, texts: Sequence[str], links: Sequence[str] = ()) -> None:
-    """Give each dot of an artist a text that the page shows beside it, and where it leads to."""
+    """Give each dot of an artist a text that the page shows beside it, and perhaps a link."""
     shown = [as_line(each, LONGEST_TEXT) for each in texts]
     artist.set_gid(_HOVER + json.dumps([shown, list(links)]))
 
@@ -131,7 +131,7 @@ def zoomable(axes: Axes, kind: str = "number") -> None:
 
 
 def _for_page(root: ElementTree.Element) -> None:
-    """Make a picture part of a page, as it is: no ids or styles that others could have too."""
+    """Prepare a picture for a page: remove ids and styles that could clash with those of others."""
     for parent in list(root.iter()):
         for child in list(parent):
             parent.text = parent.text and parent.text.strip()
@@ -154,7 +154,7 @@ def _for_page(root: ElementTree.Element) -> None:
 
 
 def _share_style(group: ElementTree.Element) -> None:
-    """Give the style that all parts of a group have to the group."""
+    """Move a style that all parts of a group have from the parts to the group."""
     styles = {child.get("style") for child in group if child.tag != f"{{{SVG}}}defs"}
     if len(styles) == 1 and len(group) > 1 and not group.get("style"):
         style = styles.pop()
@@ -165,6 +165,7 @@ def _share_style(group: ElementTree.Element) -> None:
 
 
 def _name_group(group: ElementTree.Element, name: str) -> None:
+    """Replace a group's id, `name`, by a class, or by the texts and links of its dots."""
     del group.attrib["id"]
     if name in _CLASSES:
         group.set("class", _CLASSES[name])
@@ -201,8 +202,8 @@ def _variable(colour: re.Match[str]) -> str:
     return _VARIABLES.get(colour[0], colour[0])
 
 
-def _tell_axes(root: ElementTree.Element, figure: Figure, axes: Axes) -> None:
-    """Say where the axes are in the picture [pt], and which values their sides have."""
+def _describe_axes(root: ElementTree.Element, figure: Figure, axes: Axes) -> None:
+    """Write to the root where the axes are [pt], and the values at their sides."""
     width, height = (72 * float(inches) for inches in figure.get_size_inches())
     at = axes.get_position()
     box = (at.x0 * width, (1 - at.y1) * height, at.width * width, at.height * height)
@@ -228,11 +229,11 @@ def as_png(draw: Draw, height_in: float, width_in: float = WIDTH_IN) -> bytes:
 
 @contextlib.contextmanager
 def _drawn(draw: Draw, width_in: float, height_in: float) -> Iterator[Figure]:
-    """Yield a figure that is drawn, while matplotlib's options are those of this module.
+    """Yield a figure with its drawing, while matplotlib's options are those of this module.
 
-    Its canvas is asked directly: `savefig` would draw all of it twice for its layout.
+    Write it by its canvas: `savefig` would draw all of it twice for its layout.
     """
-    with _ALONE, mpl.rc_context(_OPTIONS), warnings.catch_warnings():
+    with _DRAWING, mpl.rc_context(_OPTIONS), warnings.catch_warnings():
         warnings.simplefilter("ignore")  # of letters that the font does not have
         layout = ConstrainedLayoutEngine(w_pad=0.03, h_pad=0.03)
         figure = Figure(figsize=(width_in, height_in), dpi=PNG_DPI, layout=layout)
@@ -290,7 +291,7 @@ def time_axis(axes: Axes, first_s: float, last_s: float) -> None:
 
 
 def clock_ticks(first_s: float, last_s: float) -> tuple[list[int], list[str]]:
-    """Return a few round times between two, in seconds of the day, and what they are called."""
+    """Return a few round times between two, in seconds of the day, and their labels."""
     length = max(last_s - first_s, 1.0)
     step = next((s for s in _STEPS if length / s <= 4.6), _STEPS[-1])
     start = int(-(-first_s // step))

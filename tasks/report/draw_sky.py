@@ -54,9 +54,9 @@ FAR_KM = 20_000.0
 
 
 def draw_sky(figure: Figure, tracks: SkyTracks, anchors: Mapping[str, str]) -> None:
-    """Draw tracklets in right ascension and declination: their end has the marker.
+    """Draw tracklets in right ascension and declination, with a marker at their end.
 
-    `anchors` are where on the page objects are shown more closely, by id.
+    `anchors` are links to the objects on the page, by id.
     """
     axes = axes_of(figure, "right ascension [deg]", "declination [deg]")
     zoomable(axes, "ra")
@@ -67,7 +67,7 @@ def draw_sky(figure: Figure, tracks: SkyTracks, anchors: Mapping[str, str]) -> N
         of_outcome = [line for line in tracks.lines if line.outcome == outcome]
         if not of_outcome:
             continue
-        lines = [_whole(line.radec_deg, centre) for line in of_outcome]
+        lines = [_unwrapped(line.radec_deg, centre) for line in of_outcome]
         x, y = np.concatenate([np.vstack([line, [np.nan, np.nan]]) for line in lines]).T
         axes.plot(x, y, color=colour, linestyle=dashes, linewidth=0.9)
         ends = np.array([line[-1] for line in lines])
@@ -79,8 +79,8 @@ def draw_sky(figure: Figure, tracks: SkyTracks, anchors: Mapping[str, str]) -> N
     legend_below(figure, axes, columns=2)
 
 
-def _whole(radec: Array, centre: float) -> Array:
-    """Return a line with right ascensions around the centre, so that it does not jump."""
+def _unwrapped(radec: Array, centre: float) -> Array:
+    """Return a line (n, 2) [deg] with right ascensions near the centre, without jumps of 360."""
     ra = (radec[:, 0] - centre + 180.0) % 360.0 - 180.0 + centre
     ra = np.where(ra - ra[0] > 180, ra - 360, np.where(ra - ra[0] < -180, ra + 360, ra))
     return np.stack([ra, radec[:, 1]], axis=1)
@@ -195,7 +195,7 @@ def _number(value: float, _: object) -> str:
 # Distributions.
 
 STEPS = 120  # of a curve
-MAX_FREEDOMS = 200  # kinds of degrees of freedom that a curve is summed of
+MAX_FREEDOMS = 200  # numbers of degrees of freedom whose distributions a curve sums
 FOUND: dict[str, Any] = {"facecolor": SKY, "edgecolor": "white", "linewidth": 0.3}
 EXPECTED: dict[str, Any] = {"color": INK, "linewidth": 1.4}
 
@@ -220,10 +220,10 @@ def draw_half_normal(figure: Figure, pairs: Chi2) -> None:
 
 
 def draw_chi2(figure: Figure, found: Chi2, what: str) -> None:
-    """Draw chi-squares, and the sum of the chi-square distributions of their freedoms.
+    """Draw chi-squares, and the sum of the distributions with their degrees of freedom.
 
-    The line is what each bar should be: a density of one degree of freedom has no end at 0. A few
-    values are no bars but dots, each at the share of values below it.
+    The line has steps, as the bars: the density of one degree of freedom is infinite at 0. A few
+    values are drawn as dots, at the share of values below them, with the cumulative distribution.
     """
     axes = axes_of(figure, f"chi-square of {what}", "share below" if len(found.few) else "density")
     label = "chi-square distribution"

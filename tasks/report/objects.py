@@ -28,10 +28,10 @@ LARGEST_LATITUDE_DEG = 20.0
 class NightObject(NamedTuple):
     """An object.
 
-    ends : (longitude, latitude [deg], radius [km]) at its first and at its last position; of an
-        object without positions twice that at the epoch of its orbit. None: not known.
-    sigma_km : of its positions, their median, or of its orbit: the root of the sum of the
-        variances of x, y and z; NaN where neither is known
+    ends : (longitude, latitude [deg], radius [km]) at its first and at its last position; without
+        positions, both at the epoch of its orbit; None where unknown
+    sigma_km : median over its positions, or that of its orbit: the root of the sum of the
+        variances of x, y and z; NaN where unknown
     elements : semi-major axis [km], eccentricity, inclination [deg] of its orbit; None: no orbit
     element_sigmas : their sigmas; NaN without an orbit
     """
@@ -51,7 +51,7 @@ class NightObject(NamedTuple):
 
     @property
     def about(self) -> str:
-        """Which it is, in a line."""
+        """A line of text about it."""
         name = f" {self.name}" if self.name else ""
         sigma = f", sigma {self.sigma_km:.3g} km" if self.sigma_km == self.sigma_km else ""
         return (
@@ -85,34 +85,26 @@ def read_objects(night: NightReader) -> list[NightObject]:
     names = ["a_km", "e", "i_deg"]
     columns = ["object_id", *names, *(f"sigma_{name}" for name in names)]
     elements = night.read("orbits", columns).rows_by_key("object_id", unique=True)
-    return [
-        NightObject(
-            row["object_id"],
-            status.get(row["object_id"], NameStatus.UNKNOWN.value),
-            row["name"] or "",
-            row["verdict"],
-            row["n_positions"],
-            row["first_ns"],
-            row["last_ns"],
-            row["n_sensors"],
-            sigma_km,
-            ends,
-            orbit[:3] if orbit else None,
-            orbit[3:] if orbit else _NO_SIGMAS,
-        )
-        for row in found.with_columns(
-            first_ns=pl.col("first_time").dt.epoch("ns"), last_ns=pl.col("last_time").dt.epoch("ns")
-        ).to_dicts()
-        for ends, sigma_km in (located.get(row["object_id"], (None, float("nan"))),)
-        for orbit in (elements.get(row["object_id"]),)
-    ]
+    objects = []
+    for row in found.with_columns(
+        first_ns=pl.col("first_time").dt.epoch("ns"), last_ns=pl.col("last_time").dt.epoch("ns")
+    ).to_dicts():
+        name = row["object_id"]
+        ends, sigma_km = located.get(name, (None, float("nan")))
+        orbit = elements.get(name)
+        objects.append(NightObject(
+            name, status.get(name, NameStatus.UNKNOWN.value), row["name"] or "", row["verdict"],
+            row["n_positions"], row["first_ns"], row["last_ns"], row["n_sensors"], sigma_km, ends,
+            orbit[:3] if orbit else None, orbit[3:] if orbit else _NO_SIGMAS,
+        ))  # fmt: skip
+    return objects
 
 
 Located = dict[str, tuple[tuple[Geography, Geography], float]]  # ends, sigma [km]
 _VARIANCE = ["cov_xx", "cov_yy", "cov_zz"]
 _SIGMA = pl.sum_horizontal(*_VARIANCE).sqrt().alias("sigma_km")
 _NO_SIGMAS = (float("nan"),) * 3
-MAX_SIGMAS = 2_000_000  # positions that a median is of; of more, every n-th
+MAX_SIGMAS = 2_000_000  # positions for the medians; of more, every n-th is taken
 
 
 def _of_positions(night: NightReader) -> Located:
@@ -169,7 +161,7 @@ POINTS = 6  # of a line, about
 class SkyTrack(NamedTuple):
     """A tracklet: its outcome, and (n, 2) right ascension and declination [deg] along it.
 
-    `object_id` is '' without an object; `about` says which it is.
+    `object_id` is '' without an object; `about` is a line of text about it.
     """
 
     outcome: str
@@ -264,7 +256,7 @@ class NightNumbers(NamedTuple):
 
 
 def read_trend(nights: Iterable[NightReader]) -> list[NightNumbers]:
-    """Return the numbers of nights, in their order. A night that cannot be read has a line."""
+    """Return the numbers of nights, in their order. A night that cannot be read is left out."""
     numbers = []
     for night in nights:
         try:

@@ -103,17 +103,16 @@ def within(members: pl.DataFrame, time: Span) -> pl.DataFrame:
 
 
 def in_pieces(members: pl.DataFrame, span: Span, max_views: int) -> pl.DataFrame:
-    """Return the members of the objects in a span, each object in a piece."""
+    """Return the members of the objects in a span, each object in one piece."""
     inside = within(members, span)
     size = inside.group_by("object").agg(pl.col("n_views").sum()).sort("object")
-    piece, in_piece = [], 0
-    number = 0
+    piece_of, number, n_in_piece = [], 0, 0
     for n_views in size["n_views"].to_list():
-        if in_piece and in_piece + n_views > max_views:
-            number, in_piece = number + 1, 0
-        in_piece += n_views
-        piece.append(number)
-    pieces = size.select("object", piece=pl.Series(piece, dtype=pl.Int64))
+        if n_in_piece and n_in_piece + n_views > max_views:
+            number, n_in_piece = number + 1, 0
+        n_in_piece += n_views
+        piece_of.append(number)
+    pieces = size.select("object", piece=pl.Series(piece_of, dtype=pl.Int64))
     return (
         members.drop("piece")
         .join(pieces, on="object")

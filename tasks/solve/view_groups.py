@@ -93,7 +93,7 @@ class ObjectViews(NamedTuple):
 
 
 def with_added_errors(views: pa.Table, added: AddedErrors) -> pa.Table:
-    """Return VIEWS of one sensor without the biases that are known, with errors that are larger."""
+    """Return VIEWS of one sensor: known biases are taken off, errors are enlarged."""
     if added == NOTHING_ADDED or not views.num_rows:
         return views
     fault = added.of(views["sensor_id"][0].as_py())
@@ -153,7 +153,7 @@ def with_stated_errors(
 ) -> ObjectViews:
     """Return views with the errors of positions that the sensors state.
 
-    Undo `with_larger_errors`, and of `with_added_errors` what it adds to positions.
+    This undoes `with_larger_errors`, and what `with_added_errors` adds to errors of positions.
     """
     stated = _scaled(views, errors, -1.0)
     if added == NOTHING_ADDED:
@@ -163,6 +163,7 @@ def with_stated_errors(
 
 
 def _scaled(views: ObjectViews, errors: pa.Table, power: float) -> ObjectViews:
+    """Return views with their shared variances times a power of the factors in SHARED_ERRORS."""
     if not errors.num_rows:
         return views
     row = pc.index_in(pa.array(views.sensor_ids), errors["sensor_id"].combine_chunks())
@@ -183,7 +184,7 @@ class ViewGroups(NamedTuple):
         In the order of the groups. Where an object's motion is known, their directions are
         corrected for the motion that their fits neglected.
     row : (n,) int
-        Where each view was in the views that were solved.
+        Row of each view in the views that were solved.
     offsets : (g + 1,) int
         Group k has the views ``offsets[k]:offsets[k + 1]``.
     object_id, epoch_ns : (g,) str, (g,) int
@@ -195,7 +196,7 @@ class ViewGroups(NamedTuple):
     used : (n,) bool
         The view takes part in the solution.
     independent : (g,) bool
-        Groups of which no two share a detection.
+        Groups that may be used together: no two of them share a detection.
     """
 
     views: ObjectViews

@@ -3,11 +3,10 @@
 A log whose times are all GPS or TAI is consistent in itself: lines of sight meet, at a wrong time.
 Satellites of a catalogue show it: all of them are early or late.
 
-1. Tracklets are compared with the catalogue at their times. If few are known satellites, they are
-   compared at times that are off by each offset in use, and by seconds. The offset with most known
-   satellites is taken.
-2. There, each tracklet says how late its satellite is. Their weighted median moves the times, and
-   they are compared again, until it stays.
+1. Tracklets are compared with the catalogue at their times. If few are known satellites, other
+   offsets are tried: those in use, and some seconds. The one with most known satellites is taken.
+2. There, each satellite is ahead of its prediction by some time. The times are moved by their
+   weighted median and compared again, until it is nearly 0.
 """
 
 from collections.abc import Sequence
@@ -27,20 +26,19 @@ from epipole.tasks.algorithms.known_objects.tracklet_matching import (
 )
 from epipole.tasks.algorithms.known_objects.tracklet_search import Pairs, SeenTracklets
 
-# Fewer known satellites than this share of the tracklets, and other offsets are tried. A catalogue
-# that has one in ten objects is spared that; times that are 4 s off leave one in twenty known.
+# Other offsets are tried if the known satellites are a smaller share of the tracklets than this. A
+# catalogue of one in ten objects has as many; with times that are 4 s off, one in twenty is known.
 FEW_KNOWN = 0.1
-# Offsets that are not in use are tried as well [s]; a third of the tracklets are known when they
-# are 2 s off.
+# Steps of the other offsets, and the largest [s]: at 2 s off, a third of the tracklets are known.
 STEP_S, FARTHEST_S = 3.0, 45.0
-FEWER = 0.9  # share of the known satellites that times keep when they move to where the median is
+MIN_KEPT = 0.9  # minimum share of the known satellites that are left when the times are moved
 MAX_ROUNDS = 6  # of moving the times: 2 s are found in three
 SETTLED_S = 0.01
 # Half of the normal distribution lies within this many sigmas: a median of that many satellites has
 # a sigma of 1.25 / sqrt(n) of one.
 MAD_TO_SIGMA, MEDIAN_SIGMA = 1.4826, 1.2533
-# Drag that nobody foresaw shifts all low satellites alike: they are 1 km ahead a day after the
-# epoch of their elements, as seen in `prediction.LOW_ORBIT`.
+# Error that all low satellites share: unforeseen drag puts them 1 km ahead a day after the epoch of
+# their elements, as seen in `prediction.LOW_ORBIT`.
 SHARED_SIGMA_S = 0.1
 
 
@@ -50,9 +48,9 @@ class TimeOffset(NamedTuple):
     offset_s, sigma_s : float
         Written time minus UTC, and its 1-sigma error; NaN where no satellite is known.
     n_known : int
-        Tracklets that are known satellites if their times are off by so much.
+        Number of tracklets that are known satellites, with this offset.
     n_as_written : int
-        Those that are if the times are UTC.
+        The same with the times as written.
     """
 
     offset_s: float
@@ -76,24 +74,24 @@ def find_time_offset(
     in_use_s
         Offsets to try [s], such as those of other time scales and zones.
     """
-    as_written = _sure(tracklets, catalogue, 0.0)
+    as_written = _known_pairs(tracklets, catalogue, 0.0)
     best_s, best = 0.0, as_written
     few = len(as_written.tracklet) < FEW_KNOWN * len(tracklets.time_ns)
     steps_s = np.arange(STEP_S, FARTHEST_S + STEP_S / 2, STEP_S)
     for offset_s in [*in_use_s, *(-steps_s).tolist(), *steps_s.tolist()] if few else []:
-        sure = _sure(tracklets, catalogue, offset_s)
-        if len(sure.tracklet) > len(best.tracklet):
-            best_s, best = offset_s, sure
+        known = _known_pairs(tracklets, catalogue, offset_s)
+        if len(known.tracklet) > len(best.tracklet):
+            best_s, best = offset_s, known
     if not len(best.tracklet):
         return TimeOffset(np.nan, np.nan, 0, 0)
     sigma_s = np.nan
     for _ in range(MAX_ROUNDS):
-        late_s, sigma_s = _lateness(_moved(tracklets, best_s), best, catalogue)
-        moved = _sure(tracklets, catalogue, best_s - late_s)
-        if len(moved.tracklet) < FEWER * len(best.tracklet):
+        ahead_s, sigma_s = _time_ahead(_moved(tracklets, best_s), best, catalogue)
+        moved = _known_pairs(tracklets, catalogue, best_s - ahead_s)
+        if len(moved.tracklet) < MIN_KEPT * len(best.tracklet):
             break
-        best_s, best = best_s - late_s, moved
-        if abs(late_s) < SETTLED_S:
+        best_s, best = best_s - ahead_s, moved
+        if abs(ahead_s) < SETTLED_S:
             break
     return TimeOffset(best_s, sigma_s, len(best.tracklet), len(as_written.tracklet))
 
@@ -102,18 +100,18 @@ def _moved(tracklets: SeenTracklets, offset_s: float) -> SeenTracklets:
     return tracklets._replace(time_ns=tracklets.time_ns - round(offset_s * SECOND_NS))
 
 
-def _sure(tracklets: SeenTracklets, catalogue: KnownSatellites, offset_s: float) -> Pairs:
-    """Return the sure pairs of tracklets and satellites if the times are off by so much."""
+def _known_pairs(tracklets: SeenTracklets, catalogue: KnownSatellites, offset_s: float) -> Pairs:
+    """Return the sure pairs of a tracklet and its satellite, with an offset of the times."""
     moved = _moved(tracklets, offset_s)
     pairs = match_tracklets(moved, catalogue)
     names = judge_tracklets(len(moved.time_ns), pairs, weigh_pairs(moved, pairs, catalogue), SURE)
     return pairs.take(names.pair[names.status == "known"])
 
 
-def _lateness(
+def _time_ahead(
     tracklets: SeenTracklets, pairs: Pairs, catalogue: KnownSatellites
 ) -> tuple[float, float]:
-    """Return by how much satellites are ahead of their predictions [s], and its 1-sigma error.
+    """Return the median time [s] by which satellites are ahead of predictions, and its sigma.
 
     A satellite counts once: its tracklets share the error of its elements.
     """
@@ -129,13 +127,13 @@ def _lateness(
     per_s = jacobian[:, :, 0] * np.linalg.norm(pairs.states[:, 3:], axis=1)[:, None]
     weighted = np.linalg.solve(S, per_s[:, :, None])[:, :, 0]
     information = np.sum(weighted * per_s, axis=1)
-    late_s = np.sum(weighted * offset, axis=1) / information
-    middle_s = _weighted_median(late_s, information)
-    scatter_s = MAD_TO_SIGMA * float(np.median(np.abs(late_s - middle_s)))
+    ahead_s = np.sum(weighted * offset, axis=1) / information
+    median_s = _weighted_median(ahead_s, information)
+    scatter_s = MAD_TO_SIGMA * float(np.median(np.abs(ahead_s - median_s)))
     sigma_s = MEDIAN_SIGMA * max(
-        scatter_s / np.sqrt(len(late_s)), 1.0 / np.sqrt(float(information.sum()))
+        scatter_s / np.sqrt(len(ahead_s)), 1.0 / np.sqrt(float(information.sum()))
     )
-    return middle_s, float(np.hypot(sigma_s, SHARED_SIGMA_S))
+    return median_s, float(np.hypot(sigma_s, SHARED_SIGMA_S))
 
 
 def _weighted_median(values: Array, weight: Array) -> float:

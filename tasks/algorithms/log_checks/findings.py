@@ -38,8 +38,8 @@ class Finding(NamedTuple):
     verdict
         SOUND, WRONG or UNKNOWN.
     value, sigma, expected
-        What was measured, its 1-sigma error, and what it is in a sound log; NaN where there is no
-        such number. `unit` is theirs.
+        What was measured, its 1-sigma error, and what it is in a sound log, in `unit`; NaN where
+        there is no such number.
     cause
         The mistake, or why it is unknown; empty where it is sound.
     facts

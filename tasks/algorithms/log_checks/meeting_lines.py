@@ -1,12 +1,12 @@
 """Meeting lines: which reading of the sensors' states makes their lines of sight meet.
 
-Two sensors that see one object have it in one plane with themselves, at each epoch. Of two
-tracklets that have nothing in common, lines seldom meet by accident, and hardly at several epochs.
-So by how far each tracklet misses the nearest one of another sensor tells whether states are read
-as they were meant. Where few tracklets meet as the states are written, ordinary mistakes are tried:
-for all sensors, for one, and exchanged ephemerides. What share of the tracklets has a counterpart
-is estimated too, so a reading is named also where sensors look everywhere and most objects are seen
-by one.
+At each epoch, an object lies in one plane with two sensors that see it. The lines of sight of two
+unrelated tracklets seldom meet by accident, and hardly ever at several epochs. So the miss of each
+tracklet from the nearest one of another sensor shows whether states are read as they were meant.
+
+Where few tracklets meet as the states are written, ordinary mistakes are tried: of all sensors, of
+one, and exchanged ephemerides. The share of the tracklets that have a counterpart is estimated as
+well. So a reading is found even if most objects are seen by one sensor only.
 """
 
 from collections.abc import Iterator, Sequence
@@ -20,18 +20,18 @@ from epipole.schemas.arrays import Array, Flags, Integers
 from epipole.tasks.algorithms.constants import EARTH_RATE_RAD_S
 from epipole.tasks.algorithms.earth_gravity import propagate_states
 
-GATE = 3.0  # sigmas of the miss; its root mean square over the epochs that two tracklets share
-UNRELATED_RAD = 0.02  # views that have nothing in common miss each other by about this, or more
-TURN_RAD, N_TURNS = 0.05, 4  # 1-sigma per axis, of views that shall have nothing in common
+GATE = 3.0  # [sigma] of the miss, root mean square over the epochs that two tracklets share
+UNRELATED_RAD = 0.02  # unrelated views miss each other by about this, or more
+TURN_RAD, N_TURNS = 0.05, 4  # random rotations that make views unrelated, 1-sigma per axis
 MIN_SINE = 0.1  # of the angle between a view and the baseline: along it everything meets
 NEAREST_KM, FARTHEST_KM = 1.0, 2e5  # range of an object
 SHARES = np.array([0.02, 0.05, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 0.95, 0.98])
-MIN_MET = 4  # tracklets concerned that have a counterpart: fewer decide nothing
-# Part of the share of the tracklets that meet another, of the other sensors, that a sensor must
-# have with the reading that is named.
+MIN_MET = 4  # minimum number of tracklets that have a counterpart
+# With a reading that is named, the share of a sensor's tracklets that meet another is at least this
+# part of the same share of the other sensors.
 MIN_SHARE = 0.6
-MAX_STATED_SHARE = 0.8  # with more as stated nothing is tried
-MIN_BETTER = 0.2  # part of the tracklets with a counterpart, that have it only with the reading
+MAX_STATED_SHARE = 0.8  # nothing is tried if a larger share meets another as stated
+MIN_BETTER = 0.2  # minimum part of the counterparts that only the reading gives
 MIN_GAIN = 8.0  # log odds against the stated reading
 MIN_LEAD = 5.0  # log odds against any other
 MIN_SOUND = 3.0  # log odds that a sensor's tracklets have counterparts as the states are written
@@ -66,7 +66,7 @@ class Sights(NamedTuple):
 class NamedReading(NamedTuple):
     """A reading that makes lines meet: `sensor` is -1 where all sensors have the mistake.
 
-    Shares are those of the tracklets concerned that meet one of another sensor.
+    Shares are of the tracklets concerned: those that meet one of another sensor.
     """
 
     cause: str
@@ -82,9 +82,9 @@ class StatedMeetings(NamedTuple):
     """How tracklets of each sensor agree with those of others, as the states are written.
 
     share, by_accident : (sensors,) float
-        Of its tracklets that meet one of another sensor; and of those that would anyway.
+        Share of its tracklets that meet one of another sensor; expected share if all are unrelated.
     log_odds : (sensors,) float
-        That tracklets have counterparts, against that none of them has.
+        That some tracklets have counterparts, against none.
     """
 
     share: Array
@@ -100,8 +100,8 @@ class StatedMeetings(NamedTuple):
 class _Pairs(NamedTuple):
     """Views of two sensors at one epoch, (m,) rows a and b, by the pair of tracklets.
 
-    `number` (m,) is that of the pair, `tracklets` (pairs, 2) are its two. `survival` is the part
-    of the unrelated pairs that meet at one epoch which meet at the others too.
+    `number` (m,) is that of the pair, `tracklets` (pairs, 2) are its two. `survival` is a share of
+    unrelated pairs: of those that meet at one epoch, those that meet at the others too.
     """
 
     a: Integers
@@ -119,8 +119,8 @@ class _Pairs(NamedTuple):
 class _Nearest(NamedTuple):
     """The miss of each tracklet [sigma]: from the nearest one of another sensor, within `GATE`.
 
-    It is infinite where there is no such. `density` (tracklets,) is the number of unrelated ones
-    that is expected per sigma of the miss.
+    It is infinite where no other is within the gate. `density` (tracklets,) is the expected number
+    of unrelated ones per sigma of the miss.
     """
 
     miss: Array
@@ -137,8 +137,8 @@ class _Nearest(NamedTuple):
     def log_odds(self) -> float:
         """Return the log odds that a share of the tracklets has counterparts, against none.
 
-        The share is the most likely one. The nearest tracklet is the counterpart, with no other
-        nearer, or another one, with the counterpart farther away.
+        The share is the most likely one. Either the nearest tracklet is the counterpart, or it is
+        unrelated and the counterpart is farther away.
         """
         usable = self.density > 0
         z, density = self.miss[usable], self.density[usable]
@@ -157,7 +157,7 @@ class _Tried(NamedTuple):
 
 
 def find_reading(sights: Sights, R_gcrf_from_teme: Array) -> list[NamedReading]:
-    """Return the mistake of all sensors, or those of single ones; none where none decides.
+    """Return the mistake that all sensors have, or those of single ones; empty if none is clear.
 
     Parameters
     ----------
@@ -169,10 +169,10 @@ def find_reading(sights: Sights, R_gcrf_from_teme: Array) -> list[NamedReading]:
         return []
     sensor_of = _sensor_of(sights)
     stated = _nearest_of(sights, pairs, sights.r_km)
-    changed = list(_changed(sights.r_km, sights.v_km_s, R_gcrf_from_teme))
+    readings = list(_readings(sights.r_km, sights.v_km_s, R_gcrf_from_teme))
     n_sensors = len(np.unique(sensor_of))
     if stated.share <= MAX_STATED_SHARE:
-        tried = [_Tried(cause, -1, -1, r_km, offset_s) for cause, r_km, offset_s in changed]
+        tried = [_Tried(cause, -1, -1, r_km, offset_s) for cause, r_km, offset_s in readings]
         # With two sensors, an exchange turns the baseline, as negated axes do.
         tried += list(_exchanged(sights, [0, 1])) if n_sensors == 2 else []
         every = np.ones(len(sensor_of), bool)
@@ -181,20 +181,20 @@ def find_reading(sights: Sights, R_gcrf_from_teme: Array) -> list[NamedReading]:
     if n_sensors == 2:
         return []
     of_each = [stated.of(sensor_of == k) for k in range(n_sensors)]
-    alone = [
+    unmatched = [
         k for k, each in enumerate(of_each)
         if each.share <= MAX_STATED_SHARE and each.log_odds() < MIN_GAIN
     ]  # fmt: skip
-    if found := _best_exchanges(sights, pairs, stated, sensor_of, alone):
+    if found := _best_exchanges(sights, pairs, stated, sensor_of, unmatched):
         return found
-    for sensor in alone:
+    for sensor in unmatched:
         others = stated.of(sensor_of != sensor)
         if others.log_odds() < MIN_GAIN:
             continue  # they meet nothing either
-        mine = (sights.sensor == sensor)[:, None]
+        of_sensor = (sights.sensor == sensor)[:, None]
         tried = [
-            _Tried(cause, sensor, -1, np.where(mine, r_km, sights.r_km), offset_s)
-            for cause, r_km, offset_s in changed
+            _Tried(cause, sensor, -1, np.where(of_sensor, r_km, sights.r_km), offset_s)
+            for cause, r_km, offset_s in readings
         ]
         found += _best(sights, pairs, tried, stated, sensor_of == sensor, others.share)
     return found
@@ -222,12 +222,13 @@ def _best(
     concerned: Flags,
     expected_share: float,
 ) -> list[NamedReading]:
-    """Return the reading that wins beyond doubt, if any.
+    """Return the reading that is clearly the best, if any.
 
-    `concerned` are the tracklets; of other sensors `expected_share` meets one.
+    `concerned` (tracklets,) are those of sensors that are read anew; of the tracklets of other
+    sensors, `expected_share` meets another.
     """
     chosen = pairs.of(concerned[sights.tracklet])
-    # Where all are concerned, what two have in common is counted twice.
+    # If all are concerned, each meeting is counted for both of its tracklets.
     part = 0.5 if concerned.all() else 1.0
     as_stated = stated.of(concerned)
     scores = []
@@ -251,18 +252,14 @@ def _best(
 
 
 def _best_exchanges(
-    sights: Sights,
-    pairs: _Pairs,
-    stated: _Nearest,
-    sensor_of: Integers,
-    alone: Sequence[int],
+    sights: Sights, pairs: _Pairs, stated: _Nearest, sensor_of: Integers, sensors: Sequence[int]
 ) -> list[NamedReading]:
-    """Return the pairs of sensors whose ephemerides are exchanged, each sensor in one of them.
+    """Return the exchanges of ephemerides that are clear, each of the `sensors` in one at most.
 
-    Two sensors of a satellite have one ephemeris: an exchange of either with a third explains both.
+    Two sensors on one satellite share its ephemeris: either may be exchanged with a third.
     """
     found = []
-    tried = list(_exchanged(sights, alone))
+    tried = list(_exchanged(sights, sensors))
     for each in tried:
         concerned = np.isin(sensor_of, [each.sensor, each.other])
         others = stated.of(~concerned).share
@@ -285,7 +282,7 @@ def _sensor_of(sights: Sights) -> Integers:
 
 
 def _pairs(sights: Sights) -> _Pairs:
-    """Return the views of two sensors at one epoch, and how often unrelated ones meet again."""
+    """Return all pairs of views of two sensors at one epoch, by pair of tracklets."""
     first, second = [np.zeros(0, np.int64)], [np.zeros(0, np.int64)]
     for epoch_s in np.unique(sights.epoch_s):
         rows = np.flatnonzero(sights.epoch_s == epoch_s)
@@ -302,9 +299,9 @@ def _pairs(sights: Sights) -> _Pairs:
 
 
 def _survival(sights: Sights, pairs: _Pairs) -> float:
-    """Return which part of unrelated pairs that meet at one epoch meet at the others too.
+    """Return the `survival` of `_Pairs`: it is 1 at most.
 
-    Unrelated are views after each sensor's are turned at random.
+    Views become unrelated when each sensor's are turned at random.
     """
     rng = np.random.default_rng(1)
     n_sensors = int(sights.sensor.max(initial=-1)) + 1
@@ -320,7 +317,7 @@ def _survival(sights: Sights, pairs: _Pairs) -> float:
 
 
 def _nearest_of(sights: Sights, pairs: _Pairs, r_km: Array) -> _Nearest:
-    """Return by how far tracklets miss the nearest ones, of the pairs, with sensors at r_km."""
+    """Return by how far tracklets miss the nearest ones they are paired with, from r_km."""
     miss, chance = _misses(sights, pairs, r_km)
     n = int(sights.tracklet.max(initial=-1)) + 1
     nearest, density = np.full(n, np.inf), np.zeros(n)
@@ -331,10 +328,11 @@ def _nearest_of(sights: Sights, pairs: _Pairs, r_km: Array) -> _Nearest:
 
 
 def _misses(sights: Sights, pairs: _Pairs, r_km: Array) -> tuple[Array, Array]:
-    """Return by how much each pair of tracklets misses, and how probable the gate is anyway.
+    """Return the miss of each pair of tracklets, and the false-alarm probability of the gate.
 
-    The first is the root mean square over its epochs [sigma], infinite where lines do not meet
-    ahead of both sensors; the second is for one epoch, 0 where no epoch tells.
+    The miss is the root mean square over the epochs [sigma], infinite where lines do not meet ahead
+    of both sensors. The probability is that an unrelated pair is within the gate at one epoch, 0
+    where no epoch is usable.
     """
     a, b = pairs.a, pairs.b
     u_a, u_b, d = sights.u[a], sights.u[b], r_km[b] - r_km[a]
@@ -347,7 +345,7 @@ def _misses(sights: Sights, pairs: _Pairs, r_km: Array) -> tuple[Array, Array]:
     miss = np.einsum("ij,ij->i", normal, u_b) / (length * floor)
     cosine = np.einsum("ij,ij->i", u_a, u_b)
     apart = np.maximum(1 - cosine**2, 1e-12)
-    # An error of a position out of the plane moves the object by as much, seen from its range.
+    # A position error across the plane counts as an angle: it is divided by the range from b.
     position = np.hypot(sights.position_sigma_km[a], sights.position_sigma_km[b])
     moved = position * np.sqrt(apart) / (length * floor)
     variance = (sights.sigma_rad[a] * sine_b / floor) ** 2 + sights.sigma_rad[b] ** 2 + moved**2
@@ -366,8 +364,8 @@ def _misses(sights: Sights, pairs: _Pairs, r_km: Array) -> tuple[Array, Array]:
     return np.where(is_ahead, np.sqrt(square), np.inf), by_accident
 
 
-def _changed(r_km: Array, v_km_s: Array, R: Array) -> Iterator[tuple[str, Array, float]]:
-    """Yield what positions may be by mistake: the cause, the right positions, an offset [s]."""
+def _readings(r_km: Array, v_km_s: Array, R: Array) -> Iterator[tuple[str, Array, float]]:
+    """Yield ordinary mistakes: the cause, the positions without it, and an offset [s] or 0."""
     yield "other_inertial_frame", r_km @ R.T, 0.0
     yield "other_inertial_frame", r_km @ R, 0.0
     for order in permutations(range(3)):
@@ -385,15 +383,15 @@ def _changed(r_km: Array, v_km_s: Array, R: Array) -> Iterator[tuple[str, Array,
 
 
 def _exchanged(sights: Sights, sensors: Sequence[int]) -> Iterator[_Tried]:
-    """Yield the exchange of two ephemerides."""
+    """Yield the readings with the ephemerides of two sensors exchanged."""
     epoch_s, at = np.unique(sights.epoch_s, return_inverse=True)
     chosen = list(sensors)[:MAX_SENSORS]
     paths = {sensor: _positions_at(sights, sensor, epoch_s) for sensor in chosen}
     for a, b in combinations(chosen, 2):
         r_km = sights.r_km.copy()
         for sensor, other in ((a, b), (b, a)):
-            mine = sights.sensor == sensor
-            r_km[mine] = paths[other][at[mine]]
+            of_sensor = sights.sensor == sensor
+            r_km[of_sensor] = paths[other][at[of_sensor]]
         yield _Tried("ephemerides_exchanged", a, b, r_km)
 
 
