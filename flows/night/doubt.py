@@ -9,7 +9,7 @@ of the objects contain it.
 """
 
 import logging
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from typing import NamedTuple
 
 import numpy as np
@@ -50,58 +50,103 @@ class Settled(NamedTuple):
     clocks: tuple[SensorVerdict, ...] = ()
 
 
+class Sides(NamedTuple):
+    """Sensors by what became of their tracklets.
+
+    `disagree`: more are left out than in objects. Of the other sensors, `agree`: some are in
+    objects; `unclear`: more are undecided than in objects.
+    """
+
+    agree: set[str]
+    disagree: set[str]
+    unclear: set[str]
+
+
+class Attempt(NamedTuple):
+    """A solution of a night, its check, and which sensors agree in it."""
+
+    solved: SolvedParts
+    checked: Checked
+    sides: Sides
+
+    @property
+    def verdicts(self) -> tuple[SensorVerdict, ...]:
+        """The verdicts of the check."""
+        return self.checked.work.verdicts
+
+    def in_doubt(self) -> bool:
+        """Return whether it is not clear which sensors are wrong.
+
+        It is clear if no sensor disagrees, or those that agree are a majority. Wrong clocks count
+        on neither side: the states of the same sensor show them, without other sensors.
+        """
+        doubt, left_out = self.checked.doubt, self.checked.left_out
+        if doubt.undecided or np.isfinite(doubt.shared_s) or doubt.spread_log_odds > MIN_LOG_ODDS:
+            return True
+        late = {verdict.sensor_id for verdict in _clocks(self.verdicts)}
+        faulty = {name for name, why in left_out.items() if why != Reason.CLOCK_OFF}
+        agree = self.sides.agree - left_out.keys() - late
+        disagree = (self.sides.disagree - late) | faulty
+        return bool(disagree) and len(agree) < max(len(disagree) + 1, LEAST_AGREEING)
+
+
 def settle(work: Work, solved: SolvedParts, checked: Checked, settings: Settings) -> Settled:
     """Solve a night again where sensors are at fault, or in doubt.
 
     `work` and `solved` are of the last round of `track` and `solve`, `checked` is their check.
     """
-    window_s = settings.association.window_s
-    if not in_doubt(checked.work, solved, checked, window_s):
-        judged = _judge_left_out(work, solved, checked, settings)
+    first = Attempt(solved, checked, sides_of(work, solved, settings.association.window_s))
+    if not first.in_doubt():
+        judged = _judge_left_out(work, first, settings)
         if (settled := _solve_with_faults(work, solved, judged, settings)) is not None:
             return settled
-    wide = solve(work, settings, added=AddedErrors(WIDE_KM))
-    judged = check(work, wide, settings, correct=False)
-    clocks = _clocks(judged.work.verdicts)
-    is_clear = judged.left_out and not in_doubt(judged.work, wide, judged, window_s)
-    if is_clear and (settled := _solve_with_faults(work, wide, judged, settings)) is not None:
-        return settled
-    more_km = _error_km(checked.doubt, judged.doubt)
+    wide = _attempt(work, settings, AddedErrors(WIDE_KM))
+    if wide.checked.left_out and not wide.in_doubt():
+        settled = _solve_with_faults(work, wide.solved, wide.checked, settings)
+        if settled is not None:
+            return settled
+    more_km = _error_km(checked.doubt, wide.checked.doubt)
     LOGGER.warning(
         "sensors disagree, and who is wrong is not clear: an error of %.2g km per axis is added "
         "to the positions of all %s", more_km, many(len(work.spans), "sensor"),
     )  # fmt: skip
-    unnamed = tuple(verdict._replace(cause=SOUND) for verdict in judged.work.verdicts)
+    unnamed = tuple(verdict._replace(cause=SOUND) for verdict in wide.verdicts)
     solved = solve(work, settings, added=AddedErrors(more_km))
-    return Settled(judged.work._replace(verdicts=unnamed), solved, judged.doubt, clocks)
+    work = wide.checked.work._replace(verdicts=unnamed)
+    return Settled(work, solved, wide.checked.doubt, _clocks(wide.verdicts))
 
 
-def _judge_left_out(
-    work: Work, solved: SolvedParts, checked: Checked, settings: Settings
-) -> Checked:
+def _attempt(
+    work: Work,
+    settings: Settings,
+    added: AddedErrors,
+    left_out: Mapping[str, Reason] | None = None,
+) -> Attempt:
+    """Solve and check a night with added errors, and without some sensors."""
+    solved = solve(work, settings, left_out, added)
+    checked = check(work, solved, settings, correct=False)
+    return Attempt(solved, checked, sides_of(work, solved, settings.association.window_s))
+
+
+def _judge_left_out(work: Work, first: Attempt, settings: Settings) -> Checked:
     """Return a check that also judges sensors that are too wrong to join objects.
 
     They take part with a wide error, as do sensors left out. If other sensors are at fault then, or
-    it is not clear which, `checked` is returned. Parameters are those of `settle`.
+    it is not clear which, the check of the `first` attempt is returned.
     """
-    window_s = settings.association.window_s
-    named = {verdict.sensor_id for verdict in checked.work.verdicts if verdict.is_faulty}
-    sides = _sides(work, solved, window_s)
-    apart = (sides.disagree | sides.unclear) - named
+    checked = first.checked
+    named = {verdict.sensor_id for verdict in first.verdicts if verdict.is_faulty}
+    apart = (first.sides.disagree | first.sides.unclear) - named
     if not apart:
         return checked
     suspects = sorted(apart | set(checked.left_out))
-    wide = solve(
-        work, settings,
-        added=AddedErrors(faults=tuple(SensorFault(s, WIDE_KM, left_km=WIDE_KM) for s in suspects)),
-    )  # fmt: skip
-    judged = check(work, wide, settings, correct=False)
-    faulty = {verdict.sensor_id for verdict in judged.work.verdicts if verdict.is_faulty}
-    is_clear = not in_doubt(judged.work, wide, judged, window_s)
+    faults = tuple(SensorFault(name, WIDE_KM, left_km=WIDE_KM) for name in suspects)
+    wide = _attempt(work, settings, AddedErrors(faults=faults))
+    faulty = {verdict.sensor_id for verdict in wide.verdicts if verdict.is_faulty}
     is_consistent = (
-        faulty <= named.union(suspects) and judged.left_out.keys() >= checked.left_out.keys()
+        faulty <= named.union(suspects) and wide.checked.left_out.keys() >= checked.left_out.keys()
     )
-    return judged if is_clear and is_consistent else checked
+    return wide.checked if is_consistent and not wide.in_doubt() else checked
 
 
 def _solve_with_faults(
@@ -120,10 +165,10 @@ def _solve_with_faults(
         left_out |= {name: why for name, why in checked.left_out.items() if name not in taking_part}
         if not (checked.left_out or faults):
             break
-        solved = solve(work, settings, left_out, AddedErrors(faults=faults))
-        checked = check(work, solved, settings, correct=False)
-        if in_doubt(checked.work, solved, checked, settings.association.window_s):
+        again = _attempt(work, settings, AddedErrors(faults=faults), left_out)
+        if again.in_doubt():
             return None
+        solved, checked = again.solved, again.checked
         still_wrong = {verdict.sensor_id for verdict in verdicts if verdict.is_still_wrong}
         if checked.left_out.keys() <= still_wrong:
             break
@@ -145,35 +190,7 @@ def _clocks(verdicts: Iterable[SensorVerdict]) -> tuple[SensorVerdict, ...]:
     return tuple(verdict for verdict in verdicts if verdict.has_wrong_clock)
 
 
-def in_doubt(work: Work, solved: SolvedParts, checked: Checked, window_s: float) -> bool:
-    """Return whether it is not clear which sensors are wrong; `window_s` is that of association.
-
-    It is clear if no sensor disagrees, or those that agree are a majority. Wrong clocks count on
-    neither side: the states of the same sensor show them, without other sensors.
-    """
-    doubt = checked.doubt
-    if doubt.undecided or np.isfinite(doubt.shared_s) or doubt.spread_log_odds > MIN_LOG_ODDS:
-        return True
-    agree, disagree, _ = _sides(work, solved, window_s)
-    late = {verdict.sensor_id for verdict in _clocks(checked.work.verdicts)}
-    faulty = {name for name, why in checked.left_out.items() if why != Reason.CLOCK_OFF}
-    agree, disagree = agree - set(checked.left_out) - late, (disagree - late) | faulty
-    return bool(disagree) and len(agree) < max(len(disagree) + 1, LEAST_AGREEING)
-
-
-class _Sides(NamedTuple):
-    """Sensors by what became of their tracklets.
-
-    `disagree`: more are left out than in objects. Of the other sensors, `agree`: some are in
-    objects; `unclear`: more are undecided than in objects.
-    """
-
-    agree: set[str]
-    disagree: set[str]
-    unclear: set[str]
-
-
-def _sides(work: Work, solved: SolvedParts, window_s: float) -> _Sides:
+def sides_of(work: Work, solved: SolvedParts, window_s: float) -> Sides:
     """Return which sensors agree: each tracklet counts once per window of `window_s` [s]."""
     names = {sensor.number: sensor.sensor_id for sensor in work.spans}
     joined, left_out, unclear = (dict.fromkeys(names.values(), 0) for _ in range(3))
@@ -197,7 +214,7 @@ def _sides(work: Work, solved: SolvedParts, window_s: float) -> _Sides:
                 ):
                     of_reason[name] += count
     disagree = {name for name, count in left_out.items() if count > joined[name]}
-    return _Sides(
+    return Sides(
         {name for name, count in joined.items() if count} - disagree,
         disagree,
         {name for name, count in unclear.items() if count > joined[name]} - disagree,

@@ -334,7 +334,25 @@ def _misses(sights: Sights, pairs: _Pairs, r_km: Array) -> tuple[Array, Array]:
     of both sensors. The probability is that an unrelated pair is within the gate at one epoch, 0
     where no epoch is usable.
     """
-    a, b = pairs.a, pairs.b
+    miss, variance, usable, ahead = _misses_of_views(sights, pairs.a, pairs.b, r_km)
+    chance = np.minimum(2 * GATE * np.sqrt(variance) / UNRELATED_RAD, 1.0)
+    n = len(pairs.tracklets)
+
+    def summed(values: Array | Flags) -> Array:
+        return np.asarray(np.bincount(pairs.number, np.where(usable, values, 0.0), n))
+
+    n_usable = summed(np.ones(len(miss)))
+    is_ahead = (n_usable > 0) & (summed(ahead) == n_usable)
+    count = np.maximum(n_usable, 1)
+    rms = np.sqrt(summed(miss**2 / variance) / count)
+    return np.where(is_ahead, rms, np.inf), summed(chance) / count
+
+
+def _misses_of_views(
+    sights: Sights, a: Integers, b: Integers, r_km: Array
+) -> tuple[Array, Array, Flags, Flags]:
+    """Return by how much lines a and b (m,) miss each other: angle [rad] of b from the plane of a
+    and both sensors, its variance, whether it tells, and whether they meet ahead of both."""
     u_a, u_b, d = sights.u[a], sights.u[b], r_km[b] - r_km[a]
     length = np.maximum(np.linalg.norm(d, axis=1), 1e-9)
     normal = np.cross(d, u_a)
@@ -354,14 +372,7 @@ def _misses(sights: Sights, pairs: _Pairs, r_km: Array) -> tuple[Array, Array]:
     range_a, range_b = (along - cosine * back) / apart, (cosine * along - back) / apart
     ahead = (range_a > NEAREST_KM) & (range_b > NEAREST_KM)
     ahead &= (range_a < FARTHEST_KM) & (range_b < FARTHEST_KM)
-    n = len(pairs.tracklets)
-    n_usable = np.bincount(pairs.number, usable, n)
-    is_ahead = (n_usable > 0) & (np.bincount(pairs.number, usable & ahead, n) == n_usable)
-    count = np.maximum(n_usable, 1)
-    square = np.bincount(pairs.number, np.where(usable, miss**2 / variance, 0.0), n) / count
-    chance = np.minimum(2 * GATE * np.sqrt(variance) / UNRELATED_RAD, 1.0)
-    by_accident = np.bincount(pairs.number, np.where(usable, chance, 0.0), n) / count
-    return np.where(is_ahead, np.sqrt(square), np.inf), by_accident
+    return miss, variance, usable, ahead
 
 
 def _readings(r_km: Array, v_km_s: Array, R: Array) -> Iterator[tuple[str, Array, float]]:

@@ -29,6 +29,8 @@ MAX_TURNED = 0.5  # [rad] between two frames of a followed sensor
 MARGIN = 0.03
 # Status codes; 5 is that of a frame without centroids.
 TOO_FEW, NO_MATCH, NOT_SEARCHED, TIME_LIMIT, SEARCH_LIMIT = 1, 2, 3, 4, 6
+# Of `Memory.counters`.
+N_FIXES, PRIOR_CONFIRMED, TO_SKIP = 0, 1, 2
 
 
 class Memory(NamedTuple):
@@ -36,8 +38,9 @@ class Memory(NamedTuple):
 
     t_s, R, P : (2,), (2, 3, 3), (2, 3, 3): times [s], attitudes, sensor from ICRS, and covariances
         about the sensor axes [rad^2] of the last two identified frames, the later one last
-    counters : (3,) int64: number of these frames, 0 to 2; 1 after a frame was identified by its
-        prior, 0 after one by a search; number of further frames that are not searched
+    counters : (3,) int64: `N_FIXES`, number of these frames, 0 to 2; `PRIOR_CONFIRMED`, 1 after a
+        frame was identified by its prior, 0 after one by a search; `TO_SKIP`, number of further
+        frames that are not searched
     near, cone : (stars,) int64 and (5,): the stars around a field; how many, the direction
         (3 numbers) and the radius [rad] of the cone that holds them
     """
@@ -117,7 +120,7 @@ def remember(memory, t_s, R, P):
     copy_matrix(memory.P[1], memory.P[0])
     copy_matrix(R, memory.R[1])
     copy_matrix(P, memory.P[1])
-    memory.counters[0] = min(memory.counters[0] + 1, 2)
+    memory.counters[N_FIXES] = min(memory.counters[N_FIXES] + 1, 2)
 
 
 @borrowing_kernel
@@ -127,7 +130,7 @@ def predict(memory, t_s, R, P):
 
     R (3, 3), sensor from ICRS, and P (3, 3), about the sensor axes [rad^2], are written.
     """
-    t_fix, R_fix, P_fix, n_fixes = memory.t_s, memory.R, memory.P, memory.counters[0]
+    t_fix, R_fix, P_fix, n_fixes = memory.t_s, memory.R, memory.P, memory.counters[N_FIXES]
     if n_fixes == 0:
         return False
     dt = t_s - t_fix[1]
@@ -235,7 +238,7 @@ def _solve_near(k, frames, stars, rule, memory, scratch, solutions):
         if matches.star[m] >= 0:
             matches.star[m] = scratch.row[matches.star[m]]
     remember(memory, frames.t_s[k], solution.R, solution.P)
-    memory.counters[2] = 0
+    memory.counters[TO_SKIP] = 0
     return True
 
 
@@ -259,7 +262,7 @@ def _identify_next(k, frames, priors, stars, rule, memory, scratch, solutions):
                 scratch.P[i, i] = sigma * sigma
         if _solve_near(k, frames, stars, rule, memory, scratch, solutions):
             if attempt == 1:
-                memory.counters[1] = 1
+                memory.counters[PRIOR_CONFIRMED] = 1
             return True
     return False
 
@@ -311,9 +314,9 @@ def follow(frame_range, frames, priors, stars, rule, memory, solutions, status):
         else:
             _clear(k, frames.first, solutions)
             if status[k] != NO_MATCH and status[k] != TIME_LIMIT:
-                if frame_range.searches and memory.counters[2] == 0:
+                if frame_range.searches and memory.counters[TO_SKIP] == 0:
                     return k
-                memory.counters[2] = max(memory.counters[2] - 1, 0)
+                memory.counters[TO_SKIP] = max(memory.counters[TO_SKIP] - 1, 0)
                 if status[k] != SEARCH_LIMIT:
                     status[k] = NOT_SEARCHED
         k += frame_range.step

@@ -24,8 +24,10 @@ from epipole.tasks.algorithms.star_identification.evidence import MatchRule
 from epipole.tasks.algorithms.star_identification.following import (
     NO_MATCH,
     NOT_SEARCHED,
+    PRIOR_CONFIRMED,
     SEARCH_LIMIT,
     TIME_LIMIT,
+    TO_SKIP,
     TOO_FEW,
     FrameArrays,
     FrameRange,
@@ -301,15 +303,16 @@ class _Sequence(NamedTuple):
                 k += frame_range.step
                 continue
             solution = found.solution
-            trusted = bool(memory.counters[1]) and not np.isnan(priors.sigma_rad[k])
+            trusted = bool(memory.counters[PRIOR_CONFIRMED]) and not np.isnan(priors.sigma_rad[k])
             if solution is None:
                 # Where priors were confirmed, most frames fail because they show few stars.
                 failures = max(failures + 1, PATIENCE + 1 if trusted else 0)
-                memory.counters[2] = _skipped(failures, self._refused(k, frame_range.step))
+                memory.counters[TO_SKIP] = _skipped(failures, self._refused(k, frame_range.step))
                 stopped = SEARCH_LIMIT if found.over_budget else TIME_LIMIT
                 self.status[k] = stopped if found.exhausted else NO_MATCH
             else:
-                failures, memory.counters[1] = 0, 0  # the frame's prior, if any, was wrong
+                failures = 0
+                memory.counters[PRIOR_CONFIRMED] = 0  # the frame's prior, if any, was wrong
                 self.status[k] = 0
                 self.solutions.enter(k, solution)
                 remember(memory, self.arrays.t_s[k], solution.R_sensor_from_icrs, solution.cov_rad2)

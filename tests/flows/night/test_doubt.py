@@ -3,7 +3,7 @@
 import pyarrow as pa
 import pytest
 
-from epipole.flows.night.doubt import in_doubt
+from epipole.flows.night.doubt import Attempt, sides_of
 from epipole.flows.night.stages import Checked
 from epipole.schemas.rejects import Reason
 from epipole.schemas.spans import Sensor
@@ -51,7 +51,8 @@ def doubted(left_out, late=False):
     night.verdicts = [
         SensorVerdict(name, 0.0, 1.0, cause if name == "C" else SOUND) for name in SENSORS
     ]
-    return in_doubt(night, night, Checked(night, False, {}, Doubt()), WINDOW_NS / 1e9)
+    sides = sides_of(night, night, WINDOW_NS / 1e9)
+    return Attempt(night, Checked(night, False, {}, Doubt()), sides).in_doubt()
 
 
 @pytest.mark.parametrize(("left_out", "doubt"), [(0, False), (3, False), (11, True), (20, True)])
