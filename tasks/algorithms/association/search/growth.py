@@ -25,7 +25,12 @@ from epipole.tasks.algorithms.association.odds import (
 )
 from epipole.tasks.algorithms.association.search.candidates import best_of_sensor, lasts_throughout
 from epipole.tasks.algorithms.association.search.field_index import sensors_sharing
-from epipole.tasks.algorithms.association.search.instant_points import join, possible, solve
+from epipole.tasks.algorithms.association.search.instant_points import (
+    join,
+    n_seeing,
+    possible,
+    solve,
+)
 from epipole.tasks.algorithms.association.search.search_space import doubled
 from epipole.tasks.algorithms.association.search.sight_lines import quantile
 from epipole.tasks.algorithms.association.views import error_sr, residual, residual_chi2
@@ -238,13 +243,10 @@ def _has_unsolved_instant(views, members, seen_by):
     At first only those of the seed are solved. Other sensors may see the object at others.
     `members` (n,) are tracklets, `seen_by` (k,) as in `InstantPoints`.
     """
+    unsolved = False
     for m in range(len(seen_by)):
-        count = 0
-        for i in members:
-            count += views.seen[i, m]
-        if count >= 2 and seen_by[m] < 2:
-            return True
-    return False
+        unsolved |= seen_by[m] < 2 and n_seeing(views, members, m) >= 2
+    return unsolved
 
 
 @inlined_kernel

@@ -5,12 +5,38 @@ import numpy as np
 from epipole.tasks.algorithms.association.arcs import CONVERGED, ITERATIONS
 from epipole.tasks.algorithms.association.odds import blocked
 from epipole.tasks.algorithms.association.search.sight_lines import BEYOND, SLACK_SIGMA
-from epipole.tasks.algorithms.association.views import direction, residual
+from epipole.tasks.algorithms.association.views import SIGMA_KM, direction, residual
 from epipole.tasks.algorithms.constants import EARTH_RADIUS_KM
 from epipole.tasks.algorithms.kernels import borrowing_kernel
 from epipole.tasks.algorithms.symmetric_matrices import invert_symmetric
 
+# Two sensors are apart if the distance between them exceeds this number of its sigmas. Lines from
+# the cameras of one satellite are parallel: alone they solve no instant.
+APART_SIGMA = 3.0
 RHS = 11  # offset of the right-hand side of the normal equations, after the residual
+
+
+@borrowing_kernel
+def n_seeing(views, members, m):
+    """Return how many tracklets see the object at instant m; 1 where all are from one position.
+
+    `members` (n,) are the tracklets.
+    """
+    count, first, apart = 0, -1, False
+    for i in members:
+        if not views.seen[i, m]:
+            continue
+        count += 1
+        if first < 0:
+            first = i
+        elif not apart:
+            s, f = views.sensor[i], views.sensor[first]
+            distance2 = 0.0
+            for a in range(3):
+                distance2 += (views.camera[s, m, a] - views.camera[f, m, a]) ** 2
+            variance = views.sight[i, m, SIGMA_KM] ** 2 + views.sight[first, m, SIGMA_KM] ** 2
+            apart = distance2 > APART_SIGMA * APART_SIGMA * variance
+    return count if apart else min(count, 1)
 
 
 @borrowing_kernel
@@ -82,18 +108,16 @@ def _step(x, N, part, P):
 
 @borrowing_kernel
 def solve(views, members, points, part):
-    """Solve every instant that two members share; return chi-square and degrees of freedom.
+    """Solve every instant that members share who are apart; return chi-square, degrees of freedom.
 
     `members` (n,) are tracklets; `points`, `InstantPoints`, are written; `part` (14,) is work
     space. An instant that was solved before (by `points.seen_by`) starts from its point. NaN where
-    an instant has no solution.
+    an instant has no solution, or none is solved.
     """
     X, N, P, seen_by = points
     total, dof = 0.0, 0
     for m in range(len(views.time_s)):
-        count = 0
-        for i in members:
-            count += views.seen[i, m]
+        count = n_seeing(views, members, m)
         solved = seen_by[m] >= 2
         seen_by[m] = count
         if count < 2:
@@ -116,7 +140,7 @@ def solve(views, members, points, part):
             return np.nan, 0
         total += chi2
         dof += 2 * count - 3
-    return total, dof
+    return total if dof > 0 else np.nan, dof
 
 
 @borrowing_kernel

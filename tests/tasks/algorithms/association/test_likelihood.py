@@ -271,6 +271,28 @@ def test_an_object_that_sensors_see_one_after_the_other_is_one_group(seed):
     assert (groups.group == 0).all()
 
 
+@pytest.mark.parametrize("n_sensors", [3, 7])
+@pytest.mark.parametrize("seed", range(3))
+def test_two_cameras_of_one_satellite_are_in_one_group(seed, n_sensors):
+    """At some instants only these two see the object: their lines are parallel."""
+    times = np.arange(0.0, 24.0, 2.0)
+    scene = Scene(seed, n_sensors, times=times)
+    scene.r[1] = scene.r[0] + 0.01
+    scene.objects(5, seen_by=(0, 1, 2))
+    for i, s in enumerate(scene.sensor):
+        scene.seen[i] = times < 12.0 if s == 2 else times >= 0.0
+    groups = solve(scene.samples())
+    assert judge(scene, groups) == (1.0, 1.0)
+    assert not groups.ambiguous.any()
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_two_cameras_of_one_satellite_find_no_object_alone(seed):
+    scene = Scene(seed, 2)
+    scene.r[1] = scene.r[0] + 0.01
+    assert (solve(scene.objects(5).samples()).group < 0).all()
+
+
 def test_two_sensors_find_a_passage_of_a_few_seconds():
     times = np.arange(0.0, 30.0)
     scene = Scene(3, 2, times=times).objects(1)
