@@ -38,6 +38,9 @@ MAX_SPANS = 2  # that are looked at
 MAX_TWOS, TWO_NS = 8, 10 * SECOND_NS
 MAX_PAIRS = 60_000  # of views, of a span
 MAX_VIEWS = 250  # of an epoch: some sensors are left out where there are more
+# Share of a sensor's tracklets that meet others as the states are written, without evidence of
+# common objects: up to it there are none, with more its views are too vague to tell.
+MIN_STATED_SHARE = 0.5
 # Minimum share of a sensor's tracklets that meet others with a reading, where a fault explains
 # them too. Where the reading is right it is 0.98 and more; an ephemeris 20 km off had 0.67 of its
 # views by another.
@@ -143,7 +146,7 @@ def _as_stated(stated: StatedMeetings, sensor: int) -> Finding:
     found = Finding(LINES_OF_SIGHT, SOUND, share, expected=1.0)
     if stated.is_sound[sensor]:
         return found
-    if share <= 0.5:
+    if share <= MIN_STATED_SHARE:
         return found._replace(verdict=UNKNOWN, cause="no_common_objects")
     facts = {"share_percent": 100 * by_accident}
     return found._replace(verdict=UNKNOWN, cause="views_too_vague", facts=facts)
