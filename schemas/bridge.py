@@ -119,9 +119,11 @@ def array(values: pa.Table, name: str) -> npt.NDArray[Any]:
     Times are int64 nanoseconds, null floats NaN, strings objects (null becomes None).
     """
     column = values.column(name)
-    if column.type == TIME:
+    if column.type != TIME:
+        return column.to_numpy()
+    if column.null_count:
         return column.cast(pa.int64()).to_numpy()
-    return column.to_numpy()
+    return column.to_numpy().view(np.int64)  # a tenth of the time of a cast
 
 
 def rows_of(values: pa.Table) -> list[dict[str, Any]]:

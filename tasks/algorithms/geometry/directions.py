@@ -10,6 +10,8 @@ from epipole.schemas.arrays import Array
 from epipole.tasks.algorithms.constants import SPEED_OF_LIGHT_KM_S
 from epipole.tasks.algorithms.kernels import kernel
 
+AXES_JUMP = 0.9  # abs(u_z) at which `tangent_basis` takes other axes: far from its degenerate ones
+
 
 def matrix_from_quaternion(q: Array) -> Array:
     """Return (..., 3, 3) matrices of (..., 4) unit quaternions."""
@@ -160,7 +162,7 @@ def aberrate(u: Array, v_km_s: Array) -> Array:
 def tangent_basis(u: Array) -> Array:
     """Return (..., 2, 3): two unit vectors that complete u to a right-handed triad.
 
-    Deterministic, without a degenerate direction, and smooth except at ``abs(u_z) = 0.9``.
+    Deterministic, without a degenerate direction, and smooth except at ``abs(u_z) = AXES_JUMP``.
     """
     out = np.empty((*u.shape[:-1], 2, 3))
     _tangent_basis(np.array(u, float, order="C").reshape(-1, 3), out.reshape(-1, 2, 3))
@@ -173,7 +175,7 @@ def _tangent_basis(u, out):
     for i in range(len(u)):
         x, y, z = u[i, 0], u[i, 1], u[i, 2]
         # At right angles to u and to the z axis, or to the x axis where u is near the z axis.
-        a, b, c = (-y, x, 0.0) if abs(z) < 0.9 else (0.0, -z, y)
+        a, b, c = (-y, x, 0.0) if abs(z) < AXES_JUMP else (0.0, -z, y)
         length = np.sqrt(a * a + b * b + c * c)
         a, b, c = a / length, b / length, c / length
         out[i, 0, 0], out[i, 0, 1], out[i, 0, 2] = a, b, c

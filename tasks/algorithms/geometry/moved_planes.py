@@ -7,9 +7,7 @@ declination: there the same numbers would mean another ellipse.
 import numpy as np
 
 from epipole.schemas.arrays import Array
-from epipole.tasks.algorithms.geometry.directions import tangent_basis
-
-JUMP = 0.9  # abs(u_z) from which `tangent_basis` has other axes
+from epipole.tasks.algorithms.geometry.directions import AXES_JUMP, tangent_basis
 
 
 def on_moved_plane(cov: Array, before: Array, after: Array) -> Array:
@@ -22,7 +20,7 @@ def on_moved_plane(cov: Array, before: Array, after: Array) -> Array:
     before, after : (n, 3) float
         Directions, unit vectors.
     """
-    rows = np.flatnonzero((np.abs(before[:, 2]) < JUMP) != (np.abs(after[:, 2]) < JUMP))
+    rows = np.flatnonzero((np.abs(before[:, 2]) < AXES_JUMP) != (np.abs(after[:, 2]) < AXES_JUMP))
     if not len(rows):
         return cov
     turn = tangent_basis(after[rows]) @ np.swapaxes(tangent_basis(before[rows]), 1, 2)

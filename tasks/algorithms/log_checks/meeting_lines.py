@@ -19,6 +19,7 @@ from scipy.special import erfc
 from epipole.schemas.arrays import Array, Flags, Integers
 from epipole.tasks.algorithms.constants import EARTH_RATE_RAD_S
 from epipole.tasks.algorithms.earth_gravity import propagate_states
+from epipole.tasks.algorithms.kernels import borrowing_kernel
 
 GATE = 3.0  # [sigma] of the miss, root mean square over the epochs that two tracklets share
 UNRELATED_RAD = 0.02  # unrelated views miss each other by about this, or more
@@ -334,45 +335,57 @@ def _misses(sights: Sights, pairs: _Pairs, r_km: Array) -> tuple[Array, Array]:
     of both sensors. The probability is that an unrelated pair is within the gate at one epoch, 0
     where no epoch is usable.
     """
-    miss, variance, usable, ahead = _misses_of_views(sights, pairs.a, pairs.b, r_km)
-    chance = np.minimum(2 * GATE * np.sqrt(variance) / UNRELATED_RAD, 1.0)
-    n = len(pairs.tracklets)
-
-    def summed(values: Array | Flags) -> Array:
-        return np.asarray(np.bincount(pairs.number, np.where(usable, values, 0.0), n))
-
-    n_usable = summed(np.ones(len(miss)))
-    is_ahead = (n_usable > 0) & (summed(ahead) == n_usable)
+    sums = np.zeros((len(pairs.tracklets), 4))
+    of_views = sights.sigma_rad, np.ascontiguousarray(r_km), sights.position_sigma_km
+    _sum_misses(sights.u, *of_views, pairs.a, pairs.b, pairs.number, sums)
+    n_usable, n_ahead, square, chance = sums.T
+    is_ahead = (n_usable > 0) & (n_ahead == n_usable)
     count = np.maximum(n_usable, 1)
-    rms = np.sqrt(summed(miss**2 / variance) / count)
-    return np.where(is_ahead, rms, np.inf), summed(chance) / count
+    return np.where(is_ahead, np.sqrt(square / count), np.inf), chance / count
 
 
-def _misses_of_views(
-    sights: Sights, a: Integers, b: Integers, r_km: Array
-) -> tuple[Array, Array, Flags, Flags]:
-    """Return by how much lines a and b (m,) miss each other: angle [rad] of b from the plane of a
-    and both sensors, its variance, whether it tells, and whether they meet ahead of both."""
-    u_a, u_b, d = sights.u[a], sights.u[b], r_km[b] - r_km[a]
-    length = np.maximum(np.linalg.norm(d, axis=1), 1e-9)
-    normal = np.cross(d, u_a)
-    sine_a = np.linalg.norm(normal, axis=1) / length
-    sine_b = np.linalg.norm(np.cross(d, u_b), axis=1) / length
-    usable = (length > 1.0) & (sine_a > MIN_SINE) & (sine_b > MIN_SINE)
-    floor = np.maximum(sine_a, MIN_SINE)
-    miss = np.einsum("ij,ij->i", normal, u_b) / (length * floor)
-    cosine = np.einsum("ij,ij->i", u_a, u_b)
-    apart = np.maximum(1 - cosine**2, 1e-12)
-    # A position error across the plane counts as an angle: it is divided by the range from b.
-    position = np.hypot(sights.position_sigma_km[a], sights.position_sigma_km[b])
-    moved = position * np.sqrt(apart) / (length * floor)
-    variance = (sights.sigma_rad[a] * sine_b / floor) ** 2 + sights.sigma_rad[b] ** 2 + moved**2
-    # Ranges of the nearest points of both lines.
-    along, back = np.einsum("ij,ij->i", d, u_a), np.einsum("ij,ij->i", d, u_b)
-    range_a, range_b = (along - cosine * back) / apart, (cosine * along - back) / apart
-    ahead = (range_a > NEAREST_KM) & (range_b > NEAREST_KM)
-    ahead &= (range_a < FARTHEST_KM) & (range_b < FARTHEST_KM)
-    return miss, variance, usable, ahead
+@borrowing_kernel
+def _sum_misses(u, sigma_rad, r_km, position_sigma_km, first, second, number, sums):
+    """Add to the sums (pairs, 4) of each pair of tracklets what its lines of sight tell.
+
+    Of the usable epochs: how many there are, at how many the lines meet ahead of both sensors, the
+    squared misses [sigma^2], and the probabilities that unrelated lines are within the gate. The
+    miss is the angle of view b from the plane of view a and both sensors.
+
+    u (n, 3), sigma_rad (n,), r_km (n, 3) and position_sigma_km (n,) are of the views, as in
+    `Sights`; first, second (m,) are the views of a pair at an epoch, `number` (m,) its pair.
+    """
+    for k in range(len(first)):
+        a, b = first[k], second[k]
+        ax, ay, az = u[a, 0], u[a, 1], u[a, 2]
+        bx, by, bz = u[b, 0], u[b, 1], u[b, 2]
+        dx, dy, dz = r_km[b, 0] - r_km[a, 0], r_km[b, 1] - r_km[a, 1], r_km[b, 2] - r_km[a, 2]
+        length = max(np.sqrt(dx * dx + dy * dy + dz * dz), 1e-9)
+        # The normal of the plane, and that of view b and the baseline.
+        nx, ny, nz = dy * az - dz * ay, dz * ax - dx * az, dx * ay - dy * ax
+        mx, my, mz = dy * bz - dz * by, dz * bx - dx * bz, dx * by - dy * bx
+        sine_a = np.sqrt(nx * nx + ny * ny + nz * nz) / length
+        sine_b = np.sqrt(mx * mx + my * my + mz * mz) / length
+        if not (length > 1.0 and sine_a > MIN_SINE and sine_b > MIN_SINE):
+            continue
+        scale = length * sine_a
+        miss = (nx * bx + ny * by + nz * bz) / scale
+        cosine = ax * bx + ay * by + az * bz
+        apart = max(1.0 - cosine * cosine, 1e-12)
+        # A position error across the plane counts as an angle: it is divided by the range from b.
+        position = np.hypot(position_sigma_km[a], position_sigma_km[b])
+        moved = position * np.sqrt(apart) / scale
+        of_a = sigma_rad[a] * sine_b / sine_a
+        variance = of_a * of_a + sigma_rad[b] * sigma_rad[b] + moved * moved
+        # Ranges of the nearest points of both lines.
+        along, back = dx * ax + dy * ay + dz * az, dx * bx + dy * by + dz * bz
+        nearest = (along - cosine * back) / apart, (cosine * along - back) / apart
+        of_pair = sums[number[k]]
+        of_pair[0] += 1.0
+        if min(nearest) > NEAREST_KM and max(nearest) < FARTHEST_KM:
+            of_pair[1] += 1.0
+        of_pair[2] += miss * miss / variance
+        of_pair[3] += min(2.0 * GATE * np.sqrt(variance) / UNRELATED_RAD, 1.0)
 
 
 def _readings(r_km: Array, v_km_s: Array, R: Array) -> Iterator[tuple[str, Array, float]]:

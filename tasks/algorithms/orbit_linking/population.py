@@ -68,23 +68,21 @@ def prior_of(x, component, pulls):
 
 def log_density(states: Array) -> Array:
     """Return the log of the density of objects [1/(km^3 (km/s)^3)] about states (n, 6), GCRF."""
-    r_km, v_km_s = states[:, :3], states[:, 3:]
-    r = np.linalg.norm(r_km, axis=1)
-    radial = np.sum(r_km * v_km_s, axis=1) / r
-    level = np.sqrt(np.maximum(np.sum(v_km_s**2, axis=1) - radial**2, 1e-12))
-    circular = np.sqrt(GM_KM3_S2 / r)
-    off = (radial**2 + (level - circular) ** 2) / circular**2
-    components = [
-        np.log(share / (4.0 * np.pi**2 * sigma**2 * circular**2 * level)) - off / sigma**2 / 2
-        for share, sigma in zip(SHARE, SIGMA, strict=True)
-    ]
-    of_velocity = np.logaddexp(*components)
-    h = r - EARTH_RADIUS_KM - MIN_HEIGHT_KM
-    with np.errstate(all="ignore"):
-        per_km = (1.0 - BAND_SHARE) * np.exp(-h / SCALE_KM) / SCALE_KM
-        per_km = np.where(h < BAND_KM, per_km + BAND_SHARE / BAND_KM, per_km)
-        of_height = np.log(N_OBJECTS * per_km / (4.0 * np.pi * r**2))
-    return np.where(h < 0.0, -np.inf, of_height + of_velocity)
+    out = np.empty(len(states))
+    _write_log_density(np.array(states, float, order="C"), out)
+    return out
+
+
+@kernel
+def _write_log_density(states, out):
+    """Write `log_density` of states (n, 6) to `out` (n,)."""
+    pulls = np.empty(2)
+    for k in range(len(out)):
+        out[k] = -np.inf
+        for component in range(COMPONENTS):
+            of_component = prior_of(states[k], component, pulls)
+            of_component -= 0.5 * (pulls[0] * pulls[0] + pulls[1] * pulls[1])
+            out[k] = np.logaddexp(out[k], of_component)
 
 
 @kernel
