@@ -237,3 +237,11 @@ def bytes_in(folder: Path) -> int:
             with contextlib.suppress(FileNotFoundError):
                 total += os.lstat(os.path.join(at, name)).st_size
     return total
+
+
+def local_size(where: str) -> int | None:
+    """Return the bytes of a file of this machine; None of one behind a URL, or without access."""
+    try:
+        return os.path.getsize(where)
+    except (OSError, ValueError):  # a path with a null byte is a ValueError
+        return None

@@ -43,7 +43,7 @@ from epipole.tasks.check.check_sensors import (
     check_sensors,
 )
 from epipole.tasks.check.correct_clock import correct_clock
-from epipole.tasks.common.batches import FRAMES_OF_TASK, in_batches
+from epipole.tasks.common.batches import in_batches
 from epipole.tasks.identify.identify_span import Counts, SpanToIdentify, identify_spans
 from epipole.tasks.name.earlier_objects import EarlierObjects, EarlierViews
 from epipole.tasks.name.elements_of_night import ElementsOfNight, elements_of_night
@@ -74,7 +74,7 @@ from epipole.tasks.read.order_frames import (
     ordered_logs,
     plan_order,
 )
-from epipole.tasks.read.read_logs import LogToRead, read_logs
+from epipole.tasks.read.read_logs import LogToRead, about_frames, read_logs
 from epipole.tasks.track.join_tracklets import SensorToJoin, join_tracklets
 from epipole.tasks.track.track_span import SpanToTrack, track_spans
 
@@ -87,7 +87,7 @@ MAX_CORRECTIONS = 2
 def read(logs: Sequence[str], folder: ReadFolder, settings: Settings) -> OrderedFrames:
     """Read the logs, some per task, and order the frames and states of each sensor."""
     to_read = [LogToRead(number, log) for number, log in enumerate(logs)]
-    batches = in_batches(to_read, [FRAMES_OF_TASK] * len(logs))
+    batches = in_batches(to_read, [about_frames(log) for log in logs])
     futures = [read_logs.submit(folder, batch, settings.sensors.assume) for batch in batches]
     plan = plan_order(folder, flat(results(Stage.READ, futures, (0, 2))))
     futures = [order_sensors.submit(folder, batch, settings.sensors) for batch in plan.batches()]

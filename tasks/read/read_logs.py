@@ -8,6 +8,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from epipole.io.logs.reader import read_log_pieces
+from epipole.io.paths import local_size
 from epipole.io.work.parts import LOG_PIECE, write_part
 from epipole.io.work.work_layout import ReadFolder
 from epipole.schemas.arrays import Nanoseconds
@@ -15,11 +16,13 @@ from epipole.schemas.bridge import array
 from epipole.schemas.settings import Assumption
 from epipole.schemas.stages import Stage
 from epipole.schemas.work_tables import LogSource
-from epipole.tasks.common.batches import Batch
+from epipole.tasks.common.batches import FRAMES_OF_TASK, Batch
 from epipole.tasks.common.stage_tasks import stage_task
 from epipole.tasks.read.assume_readings import as_assumed, as_assumed_source, in_kilometres
 
 LOGGER = logging.getLogger(__name__)
+
+BYTES_OF_FRAME = 500  # of 25 centroids and a state, compressed
 
 
 class LogToRead(NamedTuple):
@@ -53,6 +56,12 @@ class ReadLog(NamedTuple):
     def is_source(self) -> bool:
         """Whether anything in it can be used."""
         return bool(self.sensors or self.n_cameras)
+
+
+def about_frames(log: str) -> int:
+    """Return about how many frames a log has, by its size; one behind a URL has a task's work."""
+    size = local_size(log)
+    return FRAMES_OF_TASK if size is None else size // BYTES_OF_FRAME
 
 
 @stage_task(Stage.READ, "{logs}", retried=True)

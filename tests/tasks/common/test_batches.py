@@ -6,11 +6,19 @@ import numpy as np
 import pytest
 
 from epipole.schemas.spans import Sensor, Span
-from epipole.tasks.common.batches import FRAMES_OF_TASK, MAX_TASKS, MIN_TASKS, in_batches
+from epipole.tasks.common.batches import (
+    FEW_TASKS,
+    FRAMES_OF_TASK,
+    MANY_TASKS,
+    MAX_TASKS,
+    OF_PIECE,
+    SMALL_TASK,
+    in_batches,
+)
 from epipole.tasks.identify.identify_span import SpanToIdentify
 
 
-@pytest.mark.parametrize("n", [1, 2, MIN_TASKS, 100, 5000])
+@pytest.mark.parametrize("n", [1, 2, MANY_TASKS, 100, 5000])
 def test_pieces_are_in_one_batch_each_in_order(n):
     sizes = np.random.default_rng(n).integers(0, 2 * FRAMES_OF_TASK, n)
     batches = in_batches(list(range(n)), sizes.tolist())
@@ -34,7 +42,15 @@ def test_tasks_have_about_equal_work():
     n_frames = np.random.default_rng(1).integers(1, 400, 10_000).tolist()
     work = [sum(n_frames[k] for k in batch) for batch in in_batches(range(10_000), n_frames)]
     assert max(work) - min(work) <= 800
-    assert sum(work) / len(work) <= FRAMES_OF_TASK
+    assert (sum(work) + 10_000 * OF_PIECE) / len(work) <= FRAMES_OF_TASK
+
+
+@pytest.mark.parametrize("n_sensors", [8, 50, 192, 1000])
+@pytest.mark.parametrize("n_frames", [0, 60, 1200])
+def test_small_work_is_not_divided_into_tasks_that_cost_more_than_they_do(n_sensors, n_frames):
+    work = [n_frames + OF_PIECE] * n_sensors
+    batches = in_batches(range(n_sensors), [n_frames] * n_sensors)
+    assert FEW_TASKS <= len(batches) <= max(FEW_TASKS, sum(work) // SMALL_TASK)
 
 
 def test_nothing_to_do_is_no_batch():
