@@ -51,7 +51,7 @@ from epipole.flows.night.stages import (
     write_night,
 )
 from epipole.flows.night.summary import Summary, many, summarise
-from epipole.flows.night.work import Work, plan_spans
+from epipole.flows.night.work import Work, cameras_of_night, plan_spans
 from epipole.flows.prefect.artifacts import shown_on_page, tell
 from epipole.flows.prefect.runners import runner_asked
 from epipole.flows.prefect.waiting_runs import waiting_nights
@@ -282,6 +282,7 @@ def make_night(
     The result does not depend on the other nights of the run. Only the check for missing sensors
     does: `usual` are those of nights before.
     """
+    frames = frames._replace(cameras=cameras_of_night(frames, night))
     checks = check_logs(frames, night, usual, settings)
     spans, left_out = plan_spans(frames, night, wrong_velocities(checks))
     work = identify(frames, spans, folder, settings)

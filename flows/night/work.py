@@ -3,12 +3,13 @@
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from typing import NamedTuple, TypeVar
 
+import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 
 from epipole.io.work.parts import Parts
 from epipole.io.work.work_layout import ReadFolder, SensorParts, WorkFolder
-from epipole.schemas.bridge import concat
+from epipole.schemas.bridge import array, concat
 from epipole.schemas.errors import LogError
 from epipole.schemas.rejects import Reason, Trait, reject_rows
 from epipole.schemas.spans import DAY_NS, SPAN_NS, Sensor, Span, day_of
@@ -110,6 +111,27 @@ def plan_spans(
             f"({', '.join(frames.sensors)}) on {night}; {_why_not(frames.rejects)}"
         )
     return spans, concat(REJECTS, rejects)
+
+
+def cameras_of_night(frames: OrderedFrames, night: str) -> pa.Table:
+    """Return CAMERAS without those that hold for frames of other nights only.
+
+    Frames of a night are those in the spans of `plan_spans`. Of a sensor without such frames, all
+    calibrations are returned.
+    """
+    cameras, day = frames.cameras, day_of(night)
+    sensor, time_ns = cameras["sensor_id"].to_numpy(), array(cameras, "time")
+    holds = np.ones(cameras.num_rows, bool)
+    for sensor_id, found in zip(frames.sensors, frames.spans, strict=True):
+        wanted = [each for each in found if _is_wanted(each.span, day)]
+        rows = np.flatnonzero(sensor == sensor_id)
+        if wanted and len(rows):
+            between_ns = [wanted[0].first_ns, wanted[-1].last_ns]
+            first, end = np.searchsorted(time_ns[rows], between_ns, side="right").tolist()
+            holds[rows] = False
+            # The first one also counts before its time.
+            holds[rows[max(first - 1, 0) : max(end, 1)]] = True
+    return cameras.filter(pa.array(holds))
 
 
 def count_frames(

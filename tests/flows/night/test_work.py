@@ -7,9 +7,9 @@ import pyarrow as pa
 import pytest
 
 from epipole.flows.night import work
-from epipole.flows.night.work import Work, count_frames, plan_spans
+from epipole.flows.night.work import Work, cameras_of_night, count_frames, plan_spans
 from epipole.io.work.work_layout import ReadFolder, WorkFolder
-from epipole.schemas.bridge import empty
+from epipole.schemas.bridge import array, empty
 from epipole.schemas.columns import TIME
 from epipole.schemas.errors import LogError
 from epipole.schemas.rejects import Reason, reject_rows
@@ -80,6 +80,28 @@ def test_invalid_calibrations_are_named_where_there_are_no_others():
     invalid = reject_rows(Reason.FOLDED_IMAGE, sensor_id="a", time=[0], count=[1])
     with pytest.raises(LogError, match=r"those in the log are invalid: folded_image: .*D folds"):
         plan_spans(found._replace(rejects=invalid), NIGHT)
+
+
+@pytest.mark.parametrize(
+    ("stated", "kept"),
+    [
+        ([-30.0, 1.0], [1.0]),  # the night before has another one
+        ([-30.0, -20.0], [-20.0]),
+        ([-30.0, 3.0], [-30.0, 3.0]),  # it changes in the night
+        ([1.0, 30.0], [1.0]),  # of the night after
+        ([4.0, 30.0], [4.0]),  # the first one also before its time
+        ([30.0, 31.0], [30.0]),
+    ],
+)
+def test_calibrations_of_other_nights_are_not_those_of_a_night(stated, kept):
+    found = frames([], a=[-30.0, 2.0, 5.0, 30.0], b=[30.0])
+    times = MIDNIGHT_NS + (np.array([*stated, -3.0]) * 3600e9).astype(np.int64)
+    rows = cameras(*["a"] * len(stated), "b")
+    at = rows.schema.get_field_index("time")
+    rows = rows.set_column(at, CAMERAS.field("time"), pa.array(times).cast(TIME))
+    of_night = cameras_of_night(found._replace(cameras=rows), NIGHT)
+    hours = (array(of_night, "time") - MIDNIGHT_NS) / 3600e9
+    assert hours.tolist() == [*kept, -3.0]
 
 
 def test_neighbours_are_worked_on_together():
