@@ -64,9 +64,19 @@ def _list_local(where: str) -> tuple[list[str], bool]:
 
 
 def _list_folder(folder: Path) -> list[str]:
-    """Return the logs in a folder, however deep; a line says which folders cannot be read."""
-    logs = []
-    for at, _, names in os.walk(folder, onerror=_warn_of_folder):
+    """Return the logs in a folder, however deep; a line says which folders cannot be read.
+
+    Links lead to folders too; a folder that several paths lead to is read once.
+    """
+    logs: list[str] = []
+    read: set[str] = set()
+    for at, folders, names in os.walk(folder, onerror=_warn_of_folder, followlinks=True):
+        real = os.path.realpath(at)
+        if real in read:
+            folders.clear()
+            continue
+        read.add(real)
+        folders.sort()
         files = (Path(at) / name for name in names if name.endswith(SUFFIX))
         logs += [str(file) for file in files if file.is_file()]
     return logs

@@ -79,6 +79,15 @@ def test_logs_in_subfolders_are_found_however_deep(where, folder):
         memory.rm("/logs", recursive=True)
 
 
+def test_logs_are_found_behind_links_and_each_folder_is_read_once(folder, tmp_path):
+    elsewhere = tmp_path / "disk2" / "day"
+    write_log(elsewhere / "x.mcap", *[instant("2019-04-02T12:00:00")] * 2)
+    (folder / "more").symlink_to(elsewhere.parent)
+    (folder / "again").symlink_to(elsewhere)
+    (elsewhere / "round").symlink_to(folder)
+    assert sorted(names(str(folder), "2019-04-02")) == sorted([*OF_THE_SECOND, "x"])
+
+
 def test_a_log_that_is_named_twice_counts_once(folder):
     where = [str(folder), f"{folder}/*.mcap", str(folder / "d2h01.mcap")]
     assert names(where, "2019-04-02") == OF_THE_SECOND
