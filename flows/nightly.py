@@ -75,6 +75,7 @@ from epipole.schemas.errors import EpipoleError, LogError, NoFramesError
 from epipole.schemas.rejects import Reason, by_reason
 from epipole.schemas.run_record import RunState
 from epipole.schemas.settings import Settings
+from epipole.schemas.spans import day_of
 from epipole.schemas.tables import REJECTS
 from epipole.tasks.publish.write_tables import into_nights, source_table
 from epipole.tasks.read.order_frames import OrderedFrames
@@ -282,7 +283,8 @@ def make_night(
     The result does not depend on the other nights of the run. Only the check for missing sensors
     does: `usual` are those of nights before.
     """
-    frames = frames._replace(cameras=cameras_of_night(frames, night))
+    folder_of_night = frames.folder._replace(day=day_of(night))
+    frames = frames._replace(folder=folder_of_night, cameras=cameras_of_night(frames, night))
     checks = check_logs(frames, night, usual, settings)
     spans, left_out = plan_spans(frames, night, wrong_velocities(checks))
     work = identify(frames, spans, folder, settings)

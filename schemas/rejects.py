@@ -176,7 +176,7 @@ class Reason(StrEnum):
         "restarted_counter",
         Stage.READ,
         "The sensor's counter of frames restarted; the frame is used, numbered on from the highest "
-        "number before.",
+        "number before in the night.",
         Trait.HARMLESS,
     )
     DUPLICATE_TIME = "duplicate_time", Stage.READ, "Another frame of the sensor has the same time."

@@ -293,7 +293,12 @@ FRAME_INDEX = schema(
         column("log", pa.int32(), doc="Index of the log in the run, in the order of names."),
         column("piece", pa.int32(), doc="Index of the piece of the log."),
         column("row", I64, doc="Row in the exposures of the piece."),
-        column("shift", I64, doc="To add to the frame's number: the sensor's counter restarted."),
+        column(
+            "shift", I64, doc="To add to the frame's number in its night: the counter restarted."
+        ),
+        column(
+            "shift_beside", I64, doc="The same in the night beside, of which it is in the margin."
+        ),
     ],
 )
 

@@ -90,9 +90,14 @@ NOTHING_ADDED = AddedErrors()
 
 
 class ReadFolder(NamedTuple):
-    """Where reading puts the content of a run's logs."""
+    """Where reading puts the content of a run's logs.
+
+    `day` is the night that is made, in days since 1970: frames are numbered by it where a counter
+    restarted. None: each by the UTC date of its time.
+    """
 
     root: Path
+    day: int | None = None
 
     def piece(self, log: int, piece: int) -> Path:
         """Return the part of one piece of a log: `LOG_PIECE`."""

@@ -112,8 +112,8 @@ SAME_FRAME_S = 0.1
 def counted_alike(before: EarlierViews, frames: Mapping[str, tuple[Array, Array]]) -> pa.Table:
     """Return the OBJECT_DETECTIONS of the night before with this night's numbers of frames.
 
-    Where a counter restarts, numbers go on from the highest one before: so they depend on which
-    logs a night was made from. What they differ by is the same in all frames of both nights.
+    Where a counter restarts, numbers go on from the highest one before in the night: so each night
+    has other numbers. What they differ by is the same in all frames of both nights.
 
     Parameters
     ----------

@@ -33,7 +33,7 @@ from epipole.schemas.bridge import (
 from epipole.schemas.columns import OPTICS_AXES
 from epipole.schemas.rejects import Reason, reject_rows
 from epipole.schemas.settings import SensorSettings
-from epipole.schemas.spans import SPAN_NS, Span
+from epipole.schemas.spans import DAY_NS, SPAN_NS, Span
 from epipole.schemas.stages import Stage
 from epipole.schemas.tables import REJECTS
 from epipole.schemas.work_tables import CAMERAS, EXPOSURES, FRAME_INDEX, LOG_STATES, LogSource
@@ -204,7 +204,9 @@ def frames_between(folder: ReadFolder, sensor: int, start_ns: int, end_ns: int) 
     frames = concat(EXPOSURES, tables)
     if len(tables) > 1:
         frames = frames.take(np.argsort(np.concatenate(rank), kind="stable"))
-    return _numbered_on(frames, array(index, "shift"))
+    in_night = folder.day is None or array(index, "time") // DAY_NS == folder.day
+    shift = np.where(in_night, array(index, "shift"), array(index, "shift_beside"))
+    return _numbered_on(frames, shift)
 
 
 def _numbered_on(frames: pa.Table, shift: Indices) -> pa.Table:
@@ -241,9 +243,11 @@ def _order_sensor(
 ) -> _OrderedSensor:
     keys, strays = _without_strays(_keys(folder, sensor), sensor)
     time_ns, number = array(keys, "time"), array(keys, "frame_number")
-    shift = restart_shifts(time_ns, number)
-    order, verdict = order_frames(np.zeros(len(time_ns), np.int64), time_ns, number + shift)
+    shift, beside = _night_shifts(time_ns, number)
+    day = time_ns // DAY_NS  # numbers may come again in another night
+    order, verdict = order_frames(day, time_ns, number + shift)
     keys = keys.append_column("shift", pa.array(shift))
+    keys = keys.append_column("shift_beside", pa.array(beside))
     index = conform(FRAME_INDEX, keys.take(order[verdict == KEEP]))
     states, repeats = _sorted_states(folder, sensor, settings)
     write_part(folder.sensor(sensor.number), READ_SENSOR, {"index": index, "states": states})
@@ -251,10 +255,32 @@ def _order_sensor(
         frames_left_out(keys.take(order[verdict == code]), reason)
         for code, reason in _DUPLICATES.items()
     ]
-    renumbered = keys.take(order[(verdict == KEEP) & (shift[order] != 0)])
-    duplicates.append(frames_left_out(renumbered, Reason.RESTARTED_COUNTER))
+    renumbered = order[(verdict == KEEP) & (shift[order] != 0)]
+    restarted = [
+        frames_left_out(keys.take(renumbered[day[renumbered] == night]), Reason.RESTARTED_COUNTER)
+        for night in np.unique(day[renumbered]).tolist()
+    ]
+    duplicates.append(concat(REJECTS, restarted))
     return _OrderedSensor(by_span(array(index, "time")), [stray_rejects(strays), *duplicates,
                                                            repeats])  # fmt: skip
+
+
+def _night_shifts(time_ns: Indices, number: Indices) -> tuple[Indices, Indices]:
+    """Return what to add to the numbers of frames in their nights, and in the nights beside these.
+
+    A night is numbered by its frames and those half an hour before and after it, so that its
+    numbers do not depend on which other nights are read. In the nights beside, numbers are those of
+    the frames that these take from this one; 0 of all others.
+    """
+    in_night, beside = np.zeros((2, len(time_ns)), np.int64)
+    day = time_ns // DAY_NS
+    for night in np.unique(day).tolist():
+        span = Span(night * DAY_NS, (night + 1) * DAY_NS).widened(SPAN_NS)
+        rows = np.flatnonzero(span.holds(time_ns))
+        shift, inside = restart_shifts(time_ns[rows], number[rows]), day[rows] == night
+        in_night[rows[inside]] = shift[inside]
+        beside[rows[~inside]] = shift[~inside]
+    return in_night, beside
 
 
 def by_span(time_ns: Indices) -> list[SpanFrames]:

@@ -5,6 +5,7 @@ import sys
 from pathlib import Path
 
 import numpy as np
+import pyarrow.compute as pc
 import pytest
 from scenes.whole_logs import read_whole
 
@@ -13,9 +14,10 @@ from epipole.io.work.parts import LOG_PIECE, write_part
 from epipole.io.work.work_layout import ReadFolder
 from epipole.schemas.bridge import array, stack, table
 from epipole.schemas.settings import Settings
+from epipole.schemas.spans import DAY_NS
 from epipole.schemas.work_tables import CAMERAS, LogSource
-from epipole.tasks.read.order_frames import OrderPlan, ordered_logs
-from epipole.tasks.read.read_logs import ReadLog
+from epipole.tasks.read.order_frames import OrderPlan, frames_between, order_logs, ordered_logs
+from epipole.tasks.read.read_logs import ReadLog, read_log_into
 
 START_NS = 1_554_091_200_000_000_000
 SECOND_NS = 1_000_000_000
@@ -159,6 +161,31 @@ def test_logs_that_each_count_from_zero_are_one_sensor(tmp_path):
     log = read(b, a)
     assert array(log.exposures, "frame_number").tolist() == list(range(10))
     assert rows(log) == [("restarted_counter", "s", "b.mcap", 5)]
+
+
+def test_the_numbers_of_a_night_do_not_depend_on_the_nights_before(tmp_path):
+    midnight_s, near_s = 20 * 3600, 20 * 3600 - 600  # after 04:00
+    before = [*enumerate(range(30)), *((40 + k, k) for k in range(20))]
+    before += [(near_s + k, 20 + k) for k in range(5)]
+    night = [(midnight_s + k, 25 + k) for k in range(10)]
+    night += [(midnight_s + 900 + k, k) for k in range(30)]
+    logs = [write(tmp_path / f"{k}.mcap", "s", of) for k, of in enumerate((before, night))]
+    read = [read_log_into(ReadFolder(tmp_path), k, str(log)) for k, log in enumerate(logs)]
+    day = START_NS // DAY_NS
+
+    def numbers(day, since_s):
+        folder = ReadFolder(tmp_path, day)
+        since_ns = START_NS + since_s * SECOND_NS
+        found = frames_between(folder, 0, since_ns, since_ns + 3600 * SECOND_NS)
+        return array(found, "frame_number").tolist()
+
+    frames = order_logs(ReadFolder(tmp_path), read, Settings().sensors)
+    assert numbers(day, near_s)[:5] == [50, 51, 52, 53, 54]
+    assert numbers(day + 1, near_s)[:5] == [20, 21, 22, 23, 24]  # in the margin of that night
+    assert numbers(day + 1, midnight_s) == [*range(25, 65)]
+    restarts = frames.rejects.filter(pc.field("reason") == "restarted_counter")
+    assert restarts["count"].to_pylist() == [25, 30]
+    assert (array(restarts, "time") // DAY_NS).tolist() == [day, day + 1]
 
 
 def test_a_single_repeated_number_is_one_reject(tmp_path):
