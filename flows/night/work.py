@@ -105,7 +105,7 @@ def plan_spans(
                 rejects.append(_without_velocity(frames.folder, number, sensor_id, day))
         elif of_day := [each for each in found if each.span.start_ns // DAY_NS == day]:
             rejects.append(_without_calibration(sensor_id, of_day))
-    if not spans:
+    if not any(spans_of_night(wanted, night) for wanted in spans.values()):
         raise LogError(
             f"{', '.join(log.name for log in frames.sources)}: no sensor has a calibration "
             f"({', '.join(frames.sensors)}) on {night}; {_why_not(frames.rejects)}"

@@ -75,6 +75,11 @@ def test_no_calibration_at_all_is_an_error_that_says_what_to_do():
         plan_spans(frames([], a=[1.0]), NIGHT)
 
 
+def test_a_calibration_of_a_sensor_beside_the_night_alone_is_not_enough():
+    with pytest.raises(LogError, match=r"no sensor has a calibration \(a, b\) on 2019-04-02"):
+        plan_spans(frames(["b"], a=[1.0], b=[-0.4, 24.1]), NIGHT)
+
+
 def test_invalid_calibrations_are_named_where_there_are_no_others():
     found = frames([], a=[1.0])
     invalid = reject_rows(Reason.FOLDED_IMAGE, sensor_id="a", time=[0], count=[1])
