@@ -4,6 +4,7 @@ import json
 import math
 from typing import Any
 
+import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 
@@ -13,7 +14,7 @@ from epipole.io.logs.listing import list_logs
 from epipole.io.logs.messages.cameras import PINHOLE_TERMS
 from epipole.io.logs.writer import distortion_of
 from epipole.io.work.work_layout import ReadFolder
-from epipole.schemas.bridge import concat
+from epipole.schemas.bridge import array, concat
 from epipole.schemas.errors import LogError
 from epipole.schemas.settings import Settings
 from epipole.schemas.spans import ALL_TIME
@@ -43,6 +44,9 @@ def calibrate(
 ) -> list[CameraReport]:
     """Return the camera of each sensor of the logs, from at most 100 of its frames.
 
+    Of a sensor with several calibrations it is that of its last frame, and of the others for which
+    this one's calibration holds.
+
     Parameters
     ----------
     logs
@@ -50,6 +54,8 @@ def calibrate(
     field_deg
         Field of view along the columns, about, of all sensors. None: as the logs' calibrations
         say, and unknown for a sensor without one.
+    settings
+        Those of a run; logs are read as `sensors.assume` says.
 
     Raises
     ------
@@ -59,7 +65,9 @@ def calibrate(
     paths = [log for where in logs for log in list_logs(where)[0]]
     with temporary_folder("calibrate") as made:
         folder = ReadFolder(made)
-        read = [read_log_into(folder, k, path) for k, path in enumerate(paths)]
+        read = [
+            read_log_into(folder, k, path, settings.sensors.assume) for k, path in enumerate(paths)
+        ]
         frames = order_logs(folder, read, settings.sensors)
         numbers = [k for k, spans in enumerate(frames.spans) if spans]
         if not numbers:
@@ -71,11 +79,15 @@ def _of_sensor(
     frames: OrderedFrames, number: int, field_deg: float | None, settings: Settings
 ) -> CameraReport:
     time_ns = frame_times(frames.folder, number)
+    cameras = frames.cameras.filter(pc.field("sensor_id") == frames.sensors[number])
+    newest = int(np.searchsorted(array(cameras, "time"), time_ns[-1], side="right")) - 1
+    if newest > 0:  # the first one also holds before its time
+        cameras = cameras.slice(newest, 1)
+        time_ns = time_ns[time_ns >= array(cameras, "time")[0]]
     rows = evenly_spaced(len(time_ns), MAX_FRAMES)
     parts = [frames_between(frames.folder, number, t, t + 1) for t in time_ns[rows].tolist()]
     exposures: pa.Table = concat(EXPOSURES, parts).combine_chunks()
     states = states_between(frames.folder, number, *ALL_TIME)
-    cameras = frames.cameras.filter(pc.field("sensor_id") == frames.sensors[number])
     return calibrate_unknown(exposures, states, cameras, field_deg, settings)
 
 

@@ -70,6 +70,7 @@ def calibrate(
             help="Field of view along the columns, about; default: what the log says.",
         ),
     ] = None,
+    assume: Assume = None,
     as_json: AsJson = False,
 ) -> None:
     """Find the cameras of sensors by their stars, and print calibrations for the log.
@@ -79,12 +80,14 @@ def calibrate(
 
     The focal length may be 1.5 times longer or shorter than the log or --field says. With
     neither, fields of 2 to 60 degrees are tried. At most 100 frames of each sensor are
-    used. No log is changed.
+    used; where its calibration changes, only those since. No log is changed.
     """
     from epipole.flows.calibrate import as_dict, lines
     from epipole.flows.calibrate import calibrate as calibrate_logs
+    from epipole.schemas.given_settings import with_assumptions
+    from epipole.schemas.settings import Settings
 
-    reports = calibrate_logs(logs, field_deg)
+    reports = calibrate_logs(logs, field_deg, with_assumptions(Settings(), assume or ()))
     if as_json:
         print_json([as_dict(report) for report in reports])
     else:
@@ -339,7 +342,8 @@ def info(logs: Logs, as_json: AsJson = False) -> None:
     from epipole.flows.command_line.log_info import describe, lines
     from epipole.io.logs.listing import list_logs
 
-    described = [describe(log) for where in logs for log in list_logs(where)[0]]
+    paths = dict.fromkeys(log for where in logs for log in list_logs(where)[0])
+    described = [describe(log) for log in paths]
     if as_json:
         print_json(described)
     else:

@@ -5,6 +5,7 @@ import logging
 import numpy as np
 import polars as pl
 import pytest
+from scenes.altered_logs import altered, table_rows
 from scenes.mirrored_logs import write_mirrored
 from scenes.simulated import scene_of
 
@@ -15,6 +16,7 @@ from epipole.io.logs.reader import read_log
 from epipole.io.logs.writer import LogWriter
 from epipole.schemas.bridge import array
 from epipole.schemas.errors import LogError
+from epipole.schemas.given_settings import with_assumptions
 from epipole.schemas.settings import Settings
 from epipole.tasks.calibrate import calibrate_sensors
 
@@ -154,6 +156,37 @@ def test_what_calibrate_prints_makes_the_log_right(log, told_px):
     K = as_dict(report)["calibration"]["K"]
     assert K[0] == pytest.approx(told_px * (1 + FOCAL), rel=2e-3)
     assert any(f'"K": [{K[0]}' in line for line in lines(report))
+
+
+def test_of_several_calibrations_the_one_of_the_last_frames_is_calibrated(right_log, tmp_path):
+    contents = read_log(str(right_log))
+    times = np.sort(array(contents.exposures, "time"))
+    half_ns = int(times[len(times) // 2])
+    (row,) = table_rows(contents.cameras)
+
+    def binned(frame):
+        scale = 0.5 if frame["time_ns"] >= half_ns else 1.0
+        pixels = {name: scale * (np.array(frame[name]) + 0.5) - 0.5 for name in ("x_px", "y_px")}
+        return pixels | {"sigma_px": scale * np.array(frame["sigma_px"])}
+
+    log = altered(right_log, tmp_path / "a.mcap", frame=binned)
+    smaller = {name: (row[name] + 0.5) / 2 - 0.5 for name in ("cx_px", "cy_px")}
+    smaller |= {name: row[name] // 2 for name in ("width", "height")}
+    smaller |= {name: row[name] / 2 for name in ("fx_px", "fy_px")}
+    with LogWriter(tmp_path / "b.mcap") as writer:
+        writer.camera("a", half_ns, row | smaller)
+    (report,) = calibrate([str(log), str(tmp_path / "b.mcap")])
+    assert report.nominal.fx_px == row["fx_px"] / 2
+    assert report.camera.fx_px == pytest.approx(row["fx_px"] / 2, rel=1e-3)
+    assert report.n_identified == report.n_frames == np.count_nonzero(times >= half_ns)
+
+
+def test_a_log_is_calibrated_as_the_settings_read_it(right_log):
+    (report,) = calibrate([str(right_log)], None, with_assumptions(Settings(), ["a.line_time_s=0"]))
+    assert "line_time_s" not in as_dict(report)["calibration"]
+    assumed = with_assumptions(Settings(), ["*.line_time_s=1e-9"])
+    (report,) = calibrate([str(right_log)], None, assumed)
+    assert as_dict(report)["calibration"]["line_time_s"] == 1e-9
 
 
 def test_frames_without_stars_are_not_calibrated(tmp_path):

@@ -190,6 +190,7 @@ def test_info_says_what_a_log_holds(epipole, night_log):
     assert (code, err) == (0, "")
     assert out.count("frames       60 at 1 Hz, 2019-04-01T04:00:") == 4
     assert out.count("calibration  512 x 512 px, 2.0 x 2.0 deg") == 4
+    assert epipole("info", night_log.parent, night_log)[1] == out  # each log once
 
 
 def test_info_says_what_cannot_be_used(epipole, tmp_path):
