@@ -157,9 +157,7 @@ def associate(views: Sequence[View], settings: Settings | None = None) -> FoundO
         time_s=np.zeros(1),
         sensor_km=np.reshape([view.position_km for view in checked], (s, 1, 3)),
         R_sensor_from_icrs=matrix_from_quaternion(attitude)[:, None],
-        half_field=np.reshape(
-            [(c.width / c.fx_px / 2, c.height / abs(c.fy_px) / 2) for c in cameras], (s, 2)
-        ),
+        half_field=np.reshape([c.half_field for c in cameras], (s, 2)),
     )
     focal_px = np.array([c.fx_px for c in cameras], float)
     groups = associate_by_likelihood(samples, focal_px, (settings or Settings()).association)

@@ -167,7 +167,7 @@ class SensorPoses:
 def _fields_of(cameras: pa.Table) -> list[tuple[float, float, float]]:
     """Return tangents of half the width and height, and the focal length [px], of each camera."""
     every = (camera_of(cameras, row) for row in range(cameras.num_rows))
-    return [(c.width / c.fx_px / 2, c.height / abs(c.fy_px) / 2, c.fx_px) for c in every]
+    return [(*c.half_field, c.fx_px) for c in every]
 
 
 class _Frames(NamedTuple):

@@ -75,6 +75,14 @@ class Camera(NamedTuple):
         return across, down
 
     @property
+    def half_field(self) -> tuple[float, float]:
+        """Tangents of half the width and height of the field of view, without distortion."""
+        across, down = self.width / 2 / self.fx_px, self.height / 2 / abs(self.fy_px)
+        if not self.fisheye:
+            return across, down
+        return float(np.tan(self._angle_rad(across))), float(np.tan(self._angle_rad(down)))
+
+    @property
     def corner_distance(self) -> float:
         """Distance of the farthest corner from the principal point [focal lengths]."""
         x = max(self.cx_px + 0.5, self.width - 0.5 - self.cx_px) / self.fx_px

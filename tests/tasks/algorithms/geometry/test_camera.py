@@ -172,6 +172,14 @@ def test_a_pixel_of_a_fisheye_spans_the_root_of_its_solid_angle(xy):
     assert pixel_angle(FISHEYE, u[:1])[0] == pytest.approx(np.sqrt(solid), rel=1e-3)
 
 
+@pytest.mark.parametrize("fisheye", [False, True])
+def test_the_middles_of_the_sides_are_at_the_tangents_of_half_the_field(fisheye):
+    camera = Camera(1000, 800, 500.0, -500.0, 499.5, 399.5, fisheye=fisheye)
+    x, y, z = unproject(camera, np.array([999.5, 499.5]), np.array([399.5, -0.5])).T
+    assert camera.half_field == pytest.approx((x[0] / z[0], abs(y[1] / z[1])))
+    assert Camera(4000, 4000, 500.0, 500.0, 1999.5, 1999.5, fisheye=True).half_field[0] > 10
+
+
 def test_the_field_of_a_fisheye_is_its_image_over_the_focal_length():
     plain = Camera(100, 50, 100.0, 100.0, 49.5, 24.5, fisheye=True)
     assert plain.field_deg == pytest.approx((np.degrees(1.0), np.degrees(0.5)))
