@@ -13,7 +13,7 @@ import polars as pl
 import pyarrow as pa
 
 from epipole.io.datasets.night_tables import read_columns
-from epipole.schemas.arrays import Array
+from epipole.schemas.arrays import Array, Indices
 from epipole.schemas.bridge import stack_covariance, to_polars
 from epipole.schemas.columns import POSITION, STATE_AXES, VELOCITY
 from epipole.schemas.tables import ORBITS, STATES
@@ -78,6 +78,11 @@ def recognise_objects(
         [hours].
     log_odds
         Minimum log odds; see `link_by_motion` for when a link is refused.
+
+    Notes
+    -----
+    Ids of one night, and of earlier ones, may be one object: each is compared with all later ones.
+    Else two earlier ids of one object would both be meant, and neither found.
     """
     before = _motions(to_polars(earlier.states), to_polars(earlier.orbits), "last")
     if not (len(objects) and len(before) and earlier_h > 0.0):
@@ -93,12 +98,20 @@ def recognise_objects(
         return {}
     both = pl.concat([before, new])
     motions = _observed(both)
-    mover = _Mover(both, motions, len(before))
+    mover = _Mover(both, motions, earlier_h * HOUR_S)
     links, _ = link_by_motion(
         motions, gap_s=earlier_h * HOUR_S, log_odds=log_odds, allowed=mover.near, moved=mover.moved
     )
-    names = both["object_id"].to_list()
-    return {names[k]: names[i] for k, i in enumerate(links.tolist()) if i >= 0}
+    names, n = both["object_id"].to_list(), len(before)
+    found = {k: _last_before(links, k, n) for k in range(n, len(names))}
+    return {names[k]: names[i] for k, i in found.items() if i >= 0}
+
+
+def _last_before(links: Indices, k: int, n: int) -> int:
+    """Return the last of the first n objects in the chain of links that ends at k; -1: none."""
+    while k >= n:
+        k = int(links[k])
+    return k
 
 
 def _motions(
@@ -132,12 +145,13 @@ def _observed(rows: pl.DataFrame) -> ObservedMotions:
 
 
 class _Mover:
-    """Moves the first n of m motions to the epochs of the others, by the forces of orbits.
+    """Moves motions to the epochs of later ones, by the forces of orbits.
 
-    `near` (m, m): motion i, moved, is within `NEAR_KM` of motion j.
+    `near` (m, m): motion i, moved, is within `NEAR_KM` of motion j, which begins up to `gap_s`
+    after its end.
     """
 
-    def __init__(self, rows: pl.DataFrame, motions: ObservedMotions, n: int) -> None:
+    def __init__(self, rows: pl.DataFrame, motions: ObservedMotions, gap_s: float) -> None:
         time_ns = rows["epoch"].cast(pl.Int64).to_numpy()
         first = np.datetime64(int(time_ns.min()), "ns").astype("datetime64[D]")
         noon = noon_ns(str(first))
@@ -151,10 +165,13 @@ class _Mover:
         self.cov[:, :6, :6] = self.R @ cov @ self.R.T
         self.cov[:, [6, 7], [6, 7]] = np.square([sigma for _, sigma in areas])
         self.near = np.zeros((len(rows), len(rows)), bool)
-        for i in range(n):
-            self.near[i, n:] = self._distances_km(i, slice(n, None)) < NEAR_KM
+        for i, end_s in enumerate(motions.last_s.tolist()):
+            gaps_s = motions.first_s - end_s
+            later = np.flatnonzero((gaps_s > 0.0) & (gaps_s <= gap_s))
+            if len(later):
+                self.near[i, later] = self._distances_km(i, later) < NEAR_KM
 
-    def _distances_km(self, i: int, later: slice) -> Array:
+    def _distances_km(self, i: int, later: Indices) -> Array:
         """Return how far the later objects are from motion i at their epochs."""
         times_s = self.epoch_s[later]
         try:

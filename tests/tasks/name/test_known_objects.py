@@ -191,6 +191,27 @@ def test_objects_that_have_only_orbits_are_recognised_a_day_later(named, fleet):
     assert rows["same_as"].to_list() == [None, *(f"old{k}" for k in range(3, 8))]
 
 
+def test_an_object_of_two_earlier_nights_is_recognised_by_its_later_id(named, fleet):
+    low = [each for each in fleet if each.elements[8] > 0.04][:8]
+    first = orbits({f"first{k}": (each, seconds(-110_000)) for k, each in enumerate(low)})
+    second = orbits({f"second{k}": (each, seconds(-60_000)) for k, each in enumerate(low)})
+    seen = {f"new{k}": (each, seconds(9000)) for k, each in enumerate(low)}
+    rows, _ = named(seen, None, earlier_orbits=pa.concat_tables([first, second]),
+                    sensors=[("a", np.zeros(3), 0.0)], unsolved=list(seen))  # fmt: skip
+    assert rows["same_as"].to_list() == [f"second{k}" for k in range(8)]
+
+
+def test_an_object_with_two_ids_in_a_night_is_recognised_by_both(named, fleet):
+    low = [each for each in fleet if each.elements[8] > 0.04][:8]
+    before = orbits({f"old{k}": (each, seconds(-70_000)) for k, each in enumerate(low[:7])})
+    seen = {f"a{k}": (each, seconds(9000)) for k, each in enumerate(low)}
+    seen |= {f"b{k}": (each, seconds(30_000)) for k, each in enumerate(low)}
+    rows, _ = named(seen, None, earlier_orbits=before, sensors=[("a", np.zeros(3), 0.0)],
+                    unsolved=list(seen))  # fmt: skip
+    ids = [*(f"old{k}" for k in range(7)), None]
+    assert rows["same_as"].to_list() == [*ids, *ids]
+
+
 def test_vague_orbits_recognise_no_objects(named, fleet):
     low = [each for each in fleet if each.elements[8] > 0.04][:3]
     before = {f"old{k}": (each, seconds(-70_000)) for k, each in enumerate(low)}
