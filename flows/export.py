@@ -4,7 +4,7 @@ import shutil
 import tempfile
 from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import polars as pl
 
@@ -25,6 +25,7 @@ from epipole.io.paths import fault_of_name
 from epipole.schemas.bridge import to_polars
 from epipole.schemas.errors import DatasetError
 from epipole.schemas.options import Message, MessageForm, MessageFrame, star_ids_of
+from epipole.tasks.algorithms.constants import SECOND_NS
 from epipole.tasks.common.orbit_forces import noon_ns, surroundings_of
 from epipole.tasks.export import (
     arcs,
@@ -44,6 +45,7 @@ OF_ARC = "A fitted state, moved through its arc: point mass and J2; not to be ex
 OF_ORBIT = "Orbit fitted to all observations of the night; covariance in the same frame."
 OF_FORCES = "Forces of the fit, by which it is moved:"
 OF_AHEAD = "It goes on after its arc: errors of the forces are not in the covariance."
+OF_FALL = "The object comes down: its ephemeris ends there."
 OF_SENSOR = "The sensor's positions and velocities at its frames, from its log."
 
 
@@ -195,10 +197,9 @@ def _write_states(kind: Message, night: _NightTables, wanted: Wanted, folder: Pa
     for name, file in _file_names(names, _ending(kind.value, wanted.form)).items():
         orbit = orbits.get(name)
         if orbit is not None:
-            comments = [OF_ORBIT, OF_FORCES, orbit["forces"]]
-            ahead_s = wanted.ahead_h * 3600
+            comments, ahead_s = [OF_ORBIT, OF_FORCES, orbit["forces"]], wanted.ahead_h * 3600
             parts = [orbit_arc(orbit, around, origin_ns, ahead_s) if moved else single_orbit(orbit)]
-            comments += [OF_AHEAD] if moved and ahead_s else []
+            comments += _of_ahead(orbit, parts[0], ahead_s) if moved else []
         elif moved:
             comments = [OF_ARC]
             parts = arcs(states[name], positions.get(name, rows.clear()))
@@ -206,6 +207,13 @@ def _write_states(kind: Message, night: _NightTables, wanted: Wanted, folder: Pa
             comments, parts = [OF_STATE], single_states(states[name].sort("epoch"))
         parts = [in_frame(part, wanted.frame.value) for part in parts]
         _write_parts(kind, folder / file, night.subject(name), parts, comments, wanted.form)
+
+
+def _of_ahead(orbit: Mapping[str, Any], arc: Ephemeris, ahead_s: float) -> list[str]:
+    """Return what is to be said of the time after an orbit's arc."""
+    lasts_s = (int(arc.time_ns[-1]) - orbit["epoch_ns"]) / SECOND_NS
+    comes_down = lasts_s < orbit["arc_s"] / 2 + ahead_s - 1.0
+    return [OF_AHEAD] * bool(ahead_s) + [OF_FALL] * comes_down
 
 
 def _write_parts(

@@ -12,6 +12,7 @@ from epipole.schemas.bridge import stack_covariance
 from epipole.schemas.columns import POSITION, STATE_AXES, VELOCITY
 from epipole.schemas.rejects import NameStatus
 from epipole.tasks.algorithms.constants import SECOND_NS, SPEED_OF_LIGHT_KM_S
+from epipole.tasks.algorithms.earth_gravity import LOWEST_ORBIT_KM
 from epipole.tasks.algorithms.geometry.directions import radec_from_unit, unit_from_radec
 from epipole.tasks.algorithms.orbits.forces import Surroundings
 from epipole.tasks.algorithms.orbits.orbit_fit import trajectory
@@ -153,8 +154,8 @@ def orbit_arc(
     around
         Counts from `origin_ns`.
     ahead_s
-        How long after the arc it goes on. The covariance is that of the fit, moved: errors of the
-        forces are not in it.
+        How long after the arc it goes on; less where the object comes down before. The covariance
+        is that of the fit, moved: errors of the forces are not in it.
     """
     half_s = max(orbit["arc_s"] / 2, 1.0)
     epoch_s = (orbit["epoch_ns"] - origin_ns) / SECOND_NS
@@ -168,6 +169,8 @@ def orbit_arc(
         for k in range(1, steps + 1):
             before, at = (end_s * step / steps for step in (k - 1, k))
             unknowns, moved = propagate_unknowns(unknowns, epoch_s + before, epoch_s + at, around)
+            if not np.linalg.norm(unknowns[:3]) > LOWEST_ORBIT_KM:
+                break
             transition = moved @ transition
             turned = R.T @ transition[:6, :6] @ R
             found.append((at, R.T @ unknowns[:6], turned @ of.covariance[0] @ turned.T))

@@ -237,6 +237,24 @@ def test_an_ephemeris_is_what_screening_services_take(frame, night_dataset, tmp_
     assert 3.0 < hours < 3.1
 
 
+def test_an_ephemeris_says_that_the_object_comes_down(night_dataset, tmp_path):
+    name = observed(night_dataset, "orbits")["object_id"][0]
+    r_km = 6378.0 + 150.0
+    low = {"x_km": r_km, "y_km": 0.0, "z_km": 0.0, "vx_km_s": 0.0, "vy_km_s": 4.0,
+           "vz_km_s": (398600.4418 / r_km - 16.0) ** 0.5,
+           "forces": "GM J2-J4 C22 Sun Moon drag 0.1000 m2/kg"}  # fmt: skip
+
+    def falling(rows):
+        return rows.with_columns(**{k: pl.lit(v).cast(rows.schema[k]) for k, v in low.items()})
+
+    out = changed(night_dataset, tmp_path / "ds", orbits=falling)
+    wanted = Wanted([name], MessageFrame.EME2000, ahead_h=24.0)
+    (path,) = written(Message.oem, out, tmp_path / "oem", wanted)
+    assert "The object comes down: its ephemeris ends there." in path.read_text()
+    (segment,) = ccsds.Oem.from_file(str(path)).segments
+    assert abs(segment.data.state_vector[-1].x) < 7e3
+
+
 def test_the_checker_of_screening_finds_what_is_wrong(night_dataset, tmp_path):
     name = observed(night_dataset, "orbits")["object_id"][0]
     (path,) = written(Message.oem, night_dataset, tmp_path / "oem", Wanted([name]))

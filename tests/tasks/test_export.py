@@ -10,6 +10,7 @@ from epipole.io.ccsds import Subject
 from epipole.schemas.bridge import to_polars
 from epipole.schemas.columns import POSITION, STATE_AXES, VELOCITY
 from epipole.schemas.tables import IDENTIFICATIONS, ORBITS, POSITIONS, STATES
+from epipole.tasks.algorithms.constants import EARTH_RADIUS_KM, GM_KM3_S2
 from epipole.tasks.common.orbit_forces import areas_in
 from epipole.tasks.export import (
     HALF_ARC_S,
@@ -141,6 +142,19 @@ def test_an_orbit_goes_on_after_its_arc_when_asked():
     true_km = positions(GEO, since_s) @ AROUND.R_night_from_gcrf
     assert np.abs(ahead.state[:, :3] - true_km).max() < 1e-3
     assert np.trace(ahead.covariance[-1][:3, :3]) > 2 * np.trace(arc.covariance[-1][:3, :3])
+
+
+def test_an_ephemeris_ends_where_the_object_comes_down():
+    r_km = EARTH_RADIUS_KM + 150.0
+    v_km_s = np.sqrt(GM_KM3_S2 / r_km) * np.array([0.0, 0.5, np.sqrt(0.75)])
+    row = orbit(LOW, 600.0, forces="GM J2-J4 C22 Sun Moon drag 0.1000 m2/kg")
+    row |= dict(zip([*POSITION, *VELOCITY], [r_km, 0.0, 0.0, *v_km_s], strict=True))
+    arc = orbit_arc(row, AROUND, NOON_NS, 40_000.0)
+    height_km = np.linalg.norm(arc.state[:, :3], axis=1) - EARTH_RADIUS_KM
+    assert 60.0 < height_km[-1] < 110.0
+    assert np.linalg.norm(arc.state[:, 3:], axis=1).max() < 8.5
+    assert 600.0 < (arc.time_ns[-1] - NOON_NS) / 1e9 < 20_000.0
+    assert np.isfinite(positive(arc.covariance)).all()
 
 
 def test_areas_are_read_from_the_forces():
