@@ -167,19 +167,23 @@ def _write_observations(night: _NightTables, wanted: Sequence[str], folder: Path
 def _write_tracking_data(night: _NightTables, wanted: Wanted, folder: Path) -> None:
     objects, tracklets = _observed(night, wanted.object_ids)
     sensors = {name for of in (*objects.values(), *tracklets.values()) for name in of["sensor_id"]}
-    ephemerides = _file_names(sorted(sensors), _ending("oem", wanted.form))
+    called, ending = _message_names(sorted(sensors)), _ending("oem", wanted.form)
+    ephemerides = {sensor: f"{name}.{ending}" for sensor, name in called.items()}
     frames = night.read("frames")
     for sensor, file in ephemerides.items():
         of_sensor = sensor_ephemeris(frames.filter(pl.col("sensor_id") == sensor))
-        text = ephemeris_message(Subject(sensor), [of_sensor], [OF_SENSOR], wanted.form)
+        subject = Subject(called[sensor])
+        text = ephemeris_message(subject, [of_sensor], [OF_SENSOR], wanted.form)
         write_message(folder / file, text)
     segments: dict[str, list[tuple[Subject, str, Directions]]] = {}
     for name, of in (*objects.items(), *tracklets.items()):
         for sensor, seen in directions(of, ephemerides).items():
             group = name if name in objects else sensor  # a sensor's tracklets are one message
-            segments.setdefault(group, []).append((night.subject(name), sensor, seen))
-    for name, file in _file_names(list(segments), _ending("tdm", wanted.form)).items():
-        write_message(folder / file, tracking_data(segments[name], wanted.form))
+            segment = night.subject(name), called[sensor], seen
+            segments.setdefault(group, []).append(segment)
+    ending = _ending("tdm", wanted.form)
+    for group, name in _message_names(list(segments)).items():
+        write_message(folder / f"{name}.{ending}", tracking_data(segments[group], wanted.form))
 
 
 def _write_states(kind: Message, night: _NightTables, wanted: Wanted, folder: Path) -> None:
@@ -194,7 +198,8 @@ def _write_states(kind: Message, night: _NightTables, wanted: Wanted, folder: Pa
     origin_ns = noon_ns(night.night)
     rows = night.read("positions") if moved else pl.DataFrame({"object_id": []})
     positions = night.by_id(rows, "object_id")
-    for name, file in _file_names(names, _ending(kind.value, wanted.form)).items():
+    ending = _ending(kind.value, wanted.form)
+    for name, stem in _message_names(names).items():
         orbit = orbits.get(name)
         if orbit is not None:
             comments, ahead_s = [OF_ORBIT, OF_FORCES, orbit["forces"]], wanted.ahead_h * 3600
@@ -206,7 +211,9 @@ def _write_states(kind: Message, night: _NightTables, wanted: Wanted, folder: Pa
         else:
             comments, parts = [OF_STATE], single_states(states[name].sort("epoch"))
         parts = [in_frame(part, wanted.frame.value) for part in parts]
-        _write_parts(kind, folder / file, night.subject(name), parts, comments, wanted.form)
+        _write_parts(
+            kind, folder / f"{stem}.{ending}", night.subject(name), parts, comments, wanted.form
+        )
 
 
 def _of_ahead(orbit: Mapping[str, Any], arc: Ephemeris, ahead_s: float) -> list[str]:
@@ -235,17 +242,17 @@ def _ending(kind: str, form: MessageForm) -> str:
     return kind if form == MessageForm.kvn else f"{kind}.{form.value}"
 
 
-def _file_names(names: Sequence[str], ending: str) -> Mapping[str, str]:
-    """Return a file name for each name; those that would be the same get a number."""
-    files: dict[str, str] = {}
+def _message_names(names: Sequence[str]) -> Mapping[str, str]:
+    """Return each one's name in messages and of its files; those that would be one get a number."""
+    found: dict[str, str] = {}
     taken: set[str] = set()
     for name in names:
-        file, number = f"{safe_name(name)}.{ending}", 2
-        while file in taken:
-            file, number = f"{safe_name(name)}-{number}.{ending}", number + 1
-        files[name] = file
-        taken.add(file)
-    return files
+        free, number = safe_name(name), 2
+        while free in taken:
+            free, number = f"{safe_name(name)}-{number}", number + 1
+        found[name] = free
+        taken.add(free)
+    return found
 
 
 def _check_out(out: Path) -> None:

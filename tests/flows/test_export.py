@@ -165,6 +165,25 @@ def test_tracklets_without_object_are_in_the_message_of_their_sensor(night_datas
     assert len([f for f in one if f.endswith(".tdm")]) == 1
 
 
+def test_sensors_have_names_of_their_own_in_messages(night_dataset, tmp_path):
+    first, second, *_ = sorted(set(observed(night_dataset)["sensor_id"]))
+
+    def cyrillic(rows):
+        names = {first: "\u0421\u0435\u0432\u0435\u0440", second: "\u0417\u0430\u043f\u0430\u0434"}
+        return rows.with_columns(pl.col("sensor_id").replace(names))
+
+    out = changed(night_dataset, tmp_path / "ds", observations=cyrillic, frames=cyrillic)
+    files = written(Message.tdm, out, tmp_path / "tdm", Wanted())
+    oem = {f.name: ccsds.Oem.from_file(str(f)).segments[0] for f in files if f.suffix == ".oem"}
+    named = {file: of.metadata.object_name for file, of in oem.items()}
+    assert {"_____.oem": "_____", "_____-2.oem": "_____-2"}.items() <= named.items()
+    tdm = next(file for file in files if file.suffix == ".tdm")
+    meta = [segment.metadata for segment in ccsds.Tdm.from_file(str(tdm)).segments]
+    assert len(meta) > 2
+    assert {each.participant_1 for each in meta} == set(named.values())
+    assert all(named[each.ephemeris_name_1] == each.participant_1 for each in meta)
+
+
 def test_one_object_can_be_asked_for(night_dataset, tmp_path):
     name = observed(night_dataset)["object_id"].drop_nulls()[0]
     files = export(Message.tdm, str(night_dataset), NIGHT, tmp_path / "a", Wanted([name]))
