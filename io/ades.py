@@ -69,7 +69,7 @@ def _identities(rows: pl.DataFrame, subjects: Mapping[str, Subject]) -> dict[str
 
 def _designator(subject: Subject) -> str:
     if subject.cospar_id:
-        return as_ascii(subject.cospar_id)[:LONGEST_NAME]
+        return as_ascii(subject.cospar_id).translate(_UNUSABLE)[:LONGEST_NAME]
     return f"NORAD {subject.norad_id}" if subject.norad_id is not None else ""
 
 

@@ -14,12 +14,14 @@ import numpy as np
 
 from epipole.schemas.arrays import Array, Integers
 from epipole.schemas.errors import DatasetError
-from epipole.schemas.text import as_line
+from epipole.schemas.text import LONGEST_LINE, as_line
 
 # Times, names and headers of all messages.
 
 ORIGINATOR = "EPIPOLE"
 _UNSAFE = re.compile(r"[^A-Za-z0-9._+-]")
+# Lines of messages have 254 characters at most (CCSDS 502.0-B-3, 7.3.3), and names of files 255.
+LONGEST_NAME, LONGEST_COMMENT = 200, 240
 
 
 def times(time_ns: Integers) -> list[str]:
@@ -34,13 +36,16 @@ def now() -> str:
 
 
 def safe_name(text: str) -> str:
-    """Return a name for a message or a file: letters, digits and ``._+-``, the rest as ``_``."""
-    return _UNSAFE.sub("_", text) or "_"
+    """Return a name for a message or a file: letters, digits and ``._+-``, the rest as ``_``.
+
+    A longer one than a line has room for is cut.
+    """
+    return _UNSAFE.sub("_", text[:LONGEST_NAME]) or "_"
 
 
-def as_ascii(text: str) -> str:
-    """Return a text as one line of ASCII."""
-    return as_line(text).encode("ascii", "replace").decode()
+def as_ascii(text: str, longest: int = LONGEST_LINE) -> str:
+    """Return a text as one line of ASCII, cut to `longest`."""
+    return as_line(text, longest).encode("ascii", "replace").decode()
 
 
 def write_message(path: Path, text: str) -> None:
@@ -86,7 +91,8 @@ class Subject(NamedTuple):
         """Return a comment with the id and the numbers in a catalogue; none without these."""
         numbers = {"NORAD": self.norad_id, "COSPAR": self.cospar_id, "NAME": self.name}
         known = [f"{what} {value}" for what, value in numbers.items() if value is not None]
-        return [as_ascii(f"ID {self.subject_id}, {', '.join(known)}")] if known else []
+        says = f"ID {self.subject_id}, {', '.join(known)}"
+        return [as_ascii(says, LONGEST_COMMENT)] if known else []
 
 
 class Ephemeris(NamedTuple):

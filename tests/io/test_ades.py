@@ -70,6 +70,15 @@ def test_all_values_are_there_and_fit_the_schema(tmp_path, schema):
     assert all(len(each["remarks"]) <= 300 for each in found)
 
 
+def test_a_damaged_designator_moves_no_columns(tmp_path, schema):
+    names = {
+        "o": Subject("o", 25544, "1998-067|A\n", "ISS")
+    }  # as checksums of elements let through
+    found = read_back(observation_file(observations(), names, "Hip2"), tmp_path, schema)
+    assert [each.get("artSat") for each in found] == ["1998-067/A\\n", None, None]
+    assert found[0]["obsTime"].endswith("Z")
+
+
 def test_times_are_those_of_the_rows_to_the_microsecond(tmp_path, schema):
     rows = observations()
     found = read_back(observation_file(rows, {}, "UNK"), tmp_path, schema)

@@ -92,6 +92,16 @@ def test_a_name_stays_one_line_of_ascii():
     assert Subject("o").comments() == []
 
 
+def test_a_long_name_fits_in_the_lines_that_readers_take():
+    long = Subject("o" * 300, 7, "2020-001A" * 50, "N" * 500)
+    for text in (
+        ephemeris_message(long, [ephemeris()], ["fitted"]),
+        state_message(long, ephemeris(1), ["fitted"]),
+    ):
+        assert max(map(len, text.splitlines())) <= 254
+    assert len(safe_name("s" * 400)) < 250
+
+
 def test_tracking_data_have_a_segment_per_sensor():
     time_ns = T0 + np.arange(2) * 1_000_000_000
     seen = Directions(
