@@ -25,6 +25,7 @@ from epipole.io.paths import fault_of_name
 from epipole.schemas.bridge import to_polars
 from epipole.schemas.errors import DatasetError
 from epipole.schemas.options import Message, MessageForm, MessageFrame, star_ids_of
+from epipole.schemas.rejects import ObjectVerdict
 from epipole.tasks.algorithms.constants import SECOND_NS
 from epipole.tasks.common.orbit_forces import noon_ns, surroundings_of
 from epipole.tasks.export import (
@@ -42,11 +43,17 @@ HOUR_NS = 3_600_000_000_000
 
 OF_STATE = "State of an object, fitted to its lines of sight; covariance in the same frame."
 OF_ARC = "A fitted state, moved through its arc: point mass and J2; not to be extrapolated."
-OF_ORBIT = "Orbit fitted to all observations of the night; covariance in the same frame."
+OF_ORBIT = "Orbit fitted to the observations of the night; covariance in the same frame."
 OF_FORCES = "Forces of the fit, by which it is moved:"
 OF_AHEAD = "It goes on after its arc: errors of the forces are not in the covariance."
 OF_FALL = "The object comes down: its ephemeris ends there."
 OF_SENSOR = "The sensor's positions and velocities at its frames, from its log."
+# Verdicts that a message has to say.
+DOUBTS = {
+    verdict.value: verdict.sentence
+    for verdict in ObjectVerdict
+    if verdict not in (ObjectVerdict.SOUND, ObjectVerdict.NO_ORBIT)
+}
 
 
 class Wanted(NamedTuple):
@@ -114,6 +121,7 @@ class _NightTables:
     def __init__(self, dataset: str, night: str) -> None:
         self.dataset, self.night = dataset, night
         self.subjects = subjects(self.read("identifications"))
+        self.verdicts = dict(self.read("objects").select("object_id", "verdict").iter_rows())
 
     def read(self, table: str) -> pl.DataFrame:
         return to_polars(read_table(self.dataset, table, self.night))
@@ -121,6 +129,11 @@ class _NightTables:
     def subject(self, name: str) -> Subject:
         """Return an object or a tracklet with what is known of it."""
         return self.subjects.get(name, Subject(name))
+
+    def doubts(self, name: str) -> list[str]:
+        """Return a comment with what is known against an object, or against a single orbit."""
+        verdict = self.verdicts.get(name)
+        return [f"Verdict {verdict}: {DOUBTS[verdict]}"] if verdict in DOUBTS else []
 
     def by_id(self, rows: pl.DataFrame, key: str) -> dict[str, pl.DataFrame]:
         """Return the rows of each object or tracklet, in the order of the ids."""
@@ -212,8 +225,9 @@ def _write_states(kind: Message, night: _NightTables, wanted: Wanted, folder: Pa
             comments, parts = [OF_STATE], single_states(states[name].sort("epoch"))
         parts = [in_frame(part, wanted.frame.value) for part in parts]
         _write_parts(
-            kind, folder / f"{stem}.{ending}", night.subject(name), parts, comments, wanted.form
-        )
+            kind, folder / f"{stem}.{ending}", night.subject(name), parts,
+            [*comments, *night.doubts(name)], wanted.form,
+        )  # fmt: skip
 
 
 def _of_ahead(orbit: Mapping[str, Any], arc: Ephemeris, ahead_s: float) -> list[str]:

@@ -256,6 +256,25 @@ def test_an_ephemeris_is_what_screening_services_take(frame, night_dataset, tmp_
     assert 3.0 < hours < 3.1
 
 
+@pytest.mark.parametrize("kind", [Message.oem, Message.opm, Message.ocm])
+def test_a_message_says_what_is_known_against_its_object(kind, night_dataset, tmp_path):
+    sound, moved, *_ = observed(night_dataset, "orbits")["object_id"].sort()
+
+    def judged(rows):
+        is_it = pl.col("object_id") == moved
+        return rows.with_columns(verdict=pl.when(is_it).then(pl.lit("manoeuvred"))
+                                 .otherwise(pl.lit("sound")))  # fmt: skip
+
+    out = changed(night_dataset, tmp_path / "ds", objects=judged)
+    (with_doubt, without) = (
+        written(kind, out, tmp_path / name, Wanted([name]))[0].read_text()
+        for name in (moved, sound)
+    )
+    assert "COMMENT Verdict manoeuvred: It changed its orbit" in with_doubt
+    assert "Verdict" not in without
+    assert max(map(len, with_doubt.splitlines()[:30])) <= 254
+
+
 def test_an_ephemeris_says_that_the_object_comes_down(night_dataset, tmp_path):
     name = observed(night_dataset, "orbits")["object_id"][0]
     r_km = 6378.0 + 150.0
