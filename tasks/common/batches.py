@@ -1,8 +1,8 @@
 """Batches: the work of a stage, divided into tasks of about equal work.
 
 A task costs about 10 ms of CPU, with Dask 150 ms, and some kilobytes of the scheduler's memory,
-however little it does. So it gets as many sensors and spans as make it worth this. The rows of a night do not depend
-on the division: each part depends on its sensor and span only.
+however little it does. So it gets as many sensors and spans as make it worth this. The rows of a
+night do not depend on the division: each part depends on its sensor and span only.
 """
 
 import itertools
