@@ -320,7 +320,7 @@ class LogCause(StrEnum):
         "numbers_stay",
         CheckVerdict.WRONG,
         "{count:.0f} of {frames:.0f} frames have the number of the one before; of frames with one "
-        "number the first is used",
+        "number the first is used, unless all have one",
         "count the frames of a sensor: a number that no other frame has",
     )
     TWO_CALIBRATIONS = (

@@ -175,8 +175,8 @@ class Reason(StrEnum):
     RESTARTED_COUNTER = (
         "restarted_counter",
         Stage.READ,
-        "The sensor's counter of frames restarted; the frame is used, numbered on from the highest "
-        "number before in the night.",
+        "The sensor's counter of frames restarted, or does not count; the frame is used, "
+        "numbered on from the highest number before in the night.",
         Trait.HARMLESS,
     )
     DUPLICATE_TIME = "duplicate_time", Stage.READ, "Another frame of the sensor has the same time."

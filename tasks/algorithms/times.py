@@ -183,6 +183,7 @@ def nearest_frame(epoch_ns: Nanoseconds, time_ns: Nanoseconds) -> Integers:
 # restarts begin higher than the one before: bursts may be numbered from 0. Two sensors with one id
 # seem to restart at each second frame, and ever higher.
 MAX_RESTARTS, MAX_HIGHER = 0.1, 0.25
+MIN_UNCOUNTED = 3  # frames with one number: of two, one may be a copy with another time
 LARGEST_NUMBER = 2**62  # with a restart after it, sums might not fit in 64 bits
 
 
@@ -192,13 +193,17 @@ def restart_shifts(time_ns: Integers, frame_number: Integers) -> Integers:
     A counter restarts with its sensor, or begins again at its end. Then the numbers go on from the
     highest one before. It has restarted where the number falls, counts up from there, and numbers
     that were used since the last restart come again: the one it falls to, or those of two frames in
-    succession before the next fall. A single wrong number does not count.
+    succession before the next fall. A single wrong number does not count. Where all frames have one
+    number, the counter was not written: they are numbered on from it, in order of time.
 
     Parameters
     ----------
     time_ns, frame_number : (n,) int
         In any order; a frame may be there several times.
     """
+    if len(frame_number) and frame_number.min() == frame_number.max() <= LARGEST_NUMBER:
+        times_ns, rank = np.unique(time_ns, return_inverse=True)
+        return rank if len(times_ns) >= MIN_UNCOUNTED else np.zeros(len(rank), np.int64)
     order = np.lexsort((frame_number, time_ns))
     t, f = time_ns[order], frame_number[order]
     first = np.ones(len(f), np.bool_)

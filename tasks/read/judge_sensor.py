@@ -201,6 +201,8 @@ def _camera(cameras: pa.Table) -> LogCamera | None:
     same = np.abs(time_ns - time_ns[first]) <= SAME_TIME_NS
     differ = (values != values[first]).any(axis=1)
     stated = dict(zip(names, values[first].tolist(), strict=True))
+    # Frames after a change of the image size may fill the largest of its images.
+    stated |= dict(zip(names[:2], values[:, :2].max(axis=0).tolist(), strict=True))
     return LogCamera(**stated, others=int((same & differ).sum()))
 
 

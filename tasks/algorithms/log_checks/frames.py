@@ -75,7 +75,10 @@ class LogFrames(NamedTuple):
 
 
 class LogCamera(NamedTuple):
-    """The first calibration of a sensor, and how many others of the same time differ from it."""
+    """The first calibration of a sensor, and how many others of the same time differ from it.
+
+    `width` and `height` are those of its largest image.
+    """
 
     width: float
     height: float

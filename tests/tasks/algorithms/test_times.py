@@ -266,6 +266,10 @@ def test_of_states_of_one_time_the_one_with_an_attitude_and_the_best_position_is
         ([0, 1, 2, 9, 3, 4, 5], [0] * 7),  # one wrong number, no other comes again
         ([0, 0, 1, 1, 2, 2, 3, 3], [0] * 8),  # two sensors with one id
         ([2**62 + 1, 2**62 + 2, 2**62 + 1, 2**62 + 2], [0] * 4),  # no room for more
+        ([0] * 5, [0, 1, 2, 3, 4]),  # never written
+        ([7] * 3, [0, 1, 2]),
+        ([7] * 2, [0] * 2),  # perhaps a copy
+        ([2**63 - 1] * 3, [0] * 3),  # no room for more
     ],
 )
 def test_numbers_go_on_where_a_counter_restarted(number, shift):

@@ -2,10 +2,12 @@
 
 from pathlib import Path
 
+import polars as pl
 import pytest
 from scenes.log_mistakes import EARTH_FIXED, MISTAKES, rewritten
 
 from epipole.io.logs.reader import read_log
+from epipole.schemas.bridge import from_polars, to_polars
 from epipole.schemas.log_checks import LISTED, CheckVerdict, LogCause, LogCheck, mistakes
 from epipole.tasks.algorithms.log_checks import findings
 from epipole.tasks.algorithms.log_checks.findings import WRONG, Finding
@@ -63,6 +65,18 @@ def test_states_beyond_the_bounds_are_named_by_what_was_left_out(sound, tmp_path
     fast = rewritten(MISTAKES["velocities in m/s"][0](sound, ["sat2"]), tmp_path / "fast.mcap")
     found = wrong(read_log(fast))
     assert found == {"sat1": [], "sat2": ["velocities_too_fast"], "sat3": [], "sat4": []}
+
+
+def test_a_change_to_larger_images_is_no_mistake(sound):
+    changed = to_polars(sound.cameras)
+    is_sat2 = pl.col("sensor_id") == "sat2"
+    halves = [pl.col(n) // 2 for n in ("width", "height")]
+    halves += [pl.col(n) / 2 for n in ("fx_px", "fy_px", "cx_px", "cy_px")]
+    binned = changed.filter(is_sat2).with_columns(*halves)
+    later = changed.with_columns(pl.when(is_sat2).then(pl.col("time").dt.offset_by("10s"))
+                                 .otherwise(pl.col("time")).alias("time"))  # fmt: skip
+    cameras = from_polars(sound.cameras.schema, pl.concat([binned, later]))
+    assert set(map(tuple, wrong(sound._replace(cameras=cameras)).values())) == {()}
 
 
 @pytest.mark.parametrize("folder", ["logs", "logs_real_orbits", "logs_constellation/patch"])
