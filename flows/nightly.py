@@ -169,6 +169,9 @@ def make_earlier_night(order: Order, night: str) -> str | None:
     except EpipoleError as error:
         LOGGER.warning("night %s: %s", night, error)
         return f"{night} failed: {error}"
+    except Exception as error:  # whatever it is
+        LOGGER.exception("night %s", night)
+        return f"{night} failed: {line_of(error)}"
     return None if summary.unchanged else f"{night} made: {summary.sentence()}"
 
 

@@ -12,7 +12,7 @@ from epipole.flows.command_line.main import app
 from epipole.flows.night.log_choice import find_logs
 from epipole.flows.night.recorded_nights import unchanged_nights
 from epipole.flows.night.stages import read
-from epipole.flows.nightly import nightly
+from epipole.flows.nightly import make_nights, nightly
 from epipole.io.datasets.dataset import read_table
 from epipole.io.logs.writer import LogWriter
 from epipole.schemas.given_settings import validate_settings
@@ -197,6 +197,26 @@ def test_what_is_wrong_with_a_night_before_does_not_stop_the_one_asked_for(tmp_p
     assert summary.unchanged
     (sentence,) = summary.earlier
     assert f"was also made from {DAYS[0]}.mcap" in sentence
+
+
+def test_an_unforeseen_error_of_a_night_before_does_not_stop_the_one_asked_for(
+    tmp_path, monkeypatch
+):
+    folder, out = tmp_path / "logs", tmp_path / "out"
+    folder.mkdir()
+    for day in DAYS:
+        write_log(folder / f"{day}.mcap", day)
+
+    def broken(order, night):
+        if night == DAYS[0]:
+            raise ZeroDivisionError("unforeseen")
+        return make_nights(order, night)
+
+    monkeypatch.setattr("epipole.flows.nightly.make_nights", broken)
+    asked = f"{DAYS[0]}/{DAYS[1]}"
+    summary = nightly(str(folder), str(out), PLAIN, night=asked)
+    assert summary.nights == [DAYS[1]]
+    assert summary.earlier == (f"{DAYS[0]} failed: unforeseen",)
 
 
 def test_sensors_that_are_absent_or_stop_early_are_named(tmp_path):
