@@ -26,8 +26,7 @@ from epipole.tasks.algorithms.log_checks.meeting_lines import (
     NamedReading,
     Sights,
     StatedMeetings,
-    find_reading,
-    stated_meetings,
+    judge_meetings,
 )
 from epipole.tasks.algorithms.orbits.reference_frames import orientation_at, to_gcrf
 from epipole.tasks.common.stage_tasks import stage_task
@@ -67,9 +66,9 @@ def judge_readings(
     rows = pa.concat_tables(tables)
     names = sorted(set(rows["sensor_id"].to_pylist()))
     sights = _sights(rows, names)
-    stated = stated_meetings(sights)
+    stated, readings = judge_meetings(sights, _gcrf_from_teme(int(array(rows, "epoch")[0])))
     found = {name: [_as_stated(stated, k)] for k, name in enumerate(names)}
-    for reading in find_reading(sights, _gcrf_from_teme(int(array(rows, "epoch")[0]))):
+    for reading in readings:
         finding = _finding(reading)
         numbers = {reading.sensor, reading.other} - {-1} or set(range(len(names)))
         concerned = {names[k] for k in numbers}

@@ -157,8 +157,28 @@ class _Tried(NamedTuple):
     offset_s: float = 0.0
 
 
-def find_reading(sights: Sights, R_gcrf_from_teme: Array) -> list[NamedReading]:
-    """Return the mistake that all sensors have, or those of single ones; empty if none is clear.
+class _Lines(NamedTuple):
+    """The lines of sight, and what they tell as the states are written.
+
+    `sensor_of` (tracklets,) is each tracklet's sensor.
+    """
+
+    sights: Sights
+    pairs: _Pairs
+    sensor_of: Integers
+    stated: _Nearest
+
+    def of_sensor(self, sensor: int) -> _Nearest:
+        """Return the misses of the sensor's tracklets."""
+        return self.stated.of(self.sensor_of == sensor)
+
+
+def judge_meetings(
+    sights: Sights, R_gcrf_from_teme: Array
+) -> tuple[StatedMeetings, list[NamedReading]]:
+    """Return how tracklets meet as stated, and the readings of the states that are clearly better.
+
+    The readings are one for all sensors, or those of single ones.
 
     Parameters
     ----------
@@ -166,27 +186,43 @@ def find_reading(sights: Sights, R_gcrf_from_teme: Array) -> list[NamedReading]:
         Rotation at the time of the views.
     """
     pairs = _pairs(sights)
-    if not len(pairs.a):
-        return []
-    sensor_of = _sensor_of(sights)
-    stated = _nearest_of(sights, pairs, sights.r_km)
-    readings = list(_readings(sights.r_km, sights.v_km_s, R_gcrf_from_teme))
+    nearest = _nearest_of(sights, pairs, sights.r_km)
+    lines = _Lines(sights, pairs, _sensor_of(sights), nearest)
+    found = _find_readings(lines, R_gcrf_from_teme) if len(pairs.a) else []
+    return _stated_meetings(lines), found
+
+
+def _stated_meetings(lines: _Lines) -> StatedMeetings:
+    n_sensors = int(lines.sensor_of.max(initial=-1)) + 1
+    of_each = [lines.of_sensor(k) for k in range(n_sensors)]
+    accident = [np.mean(-np.expm1(-GATE * each.density)) for each in of_each]
+    return StatedMeetings(
+        np.array([each.share for each in of_each]),
+        np.array(accident, float),
+        np.array([each.log_odds() for each in of_each]),
+    )
+
+
+def _find_readings(lines: _Lines, R: Array) -> list[NamedReading]:
+    """Return the mistake that all sensors have, or those of single ones; empty if none is clear."""
+    sights, sensor_of, stated = lines.sights, lines.sensor_of, lines.stated
+    readings = list(_readings(sights.r_km, sights.v_km_s, R))
     n_sensors = len(np.unique(sensor_of))
     if stated.share <= MAX_STATED_SHARE:
         tried = [_Tried(cause, -1, -1, r_km, offset_s) for cause, r_km, offset_s in readings]
         # With two sensors, an exchange turns the baseline, as negated axes do.
         tried += list(_exchanged(sights, [0, 1])) if n_sensors == 2 else []
         every = np.ones(len(sensor_of), bool)
-        if best := _best(sights, pairs, tried, stated, every, 0.0):
+        if best := _best(lines, tried, every, 0.0):
             return best
     if n_sensors == 2:
         return []
-    of_each = [stated.of(sensor_of == k) for k in range(n_sensors)]
+    of_each = [lines.of_sensor(k) for k in range(n_sensors)]
     unmatched = [
         k for k, each in enumerate(of_each)
         if each.share <= MAX_STATED_SHARE and each.log_odds() < MIN_GAIN
     ]  # fmt: skip
-    if found := _best_exchanges(sights, pairs, stated, sensor_of, unmatched):
+    if found := _best_exchanges(lines, unmatched):
         return found
     for sensor in unmatched:
         others = stated.of(sensor_of != sensor)
@@ -197,44 +233,25 @@ def find_reading(sights: Sights, R_gcrf_from_teme: Array) -> list[NamedReading]:
             _Tried(cause, sensor, -1, np.where(of_sensor, r_km, sights.r_km), offset_s)
             for cause, r_km, offset_s in readings
         ]
-        found += _best(sights, pairs, tried, stated, sensor_of == sensor, others.share)
+        found += _best(lines, tried, sensor_of == sensor, others.share)
     return found
 
 
-def stated_meetings(sights: Sights) -> StatedMeetings:
-    """Return how the tracklets of each sensor agree with those of others, as stated."""
-    pairs = _pairs(sights)
-    nearest = _nearest_of(sights, pairs, sights.r_km)
-    sensor_of = _sensor_of(sights)
-    of_each = [nearest.of(sensor_of == k) for k in range(int(sensor_of.max(initial=-1)) + 1)]
-    accident = [np.mean(-np.expm1(-GATE * each.density)) for each in of_each]
-    return StatedMeetings(
-        np.array([each.share for each in of_each]),
-        np.array(accident, float),
-        np.array([each.log_odds() for each in of_each]),
-    )
-
-
 def _best(
-    sights: Sights,
-    pairs: _Pairs,
-    tried: list[_Tried],
-    stated: _Nearest,
-    concerned: Flags,
-    expected_share: float,
+    lines: _Lines, tried: list[_Tried], concerned: Flags, expected_share: float
 ) -> list[NamedReading]:
     """Return the reading that is clearly the best, if any.
 
     `concerned` (tracklets,) are those of sensors that are read anew; of the tracklets of other
     sensors, `expected_share` meets another.
     """
-    chosen = pairs.of(concerned[sights.tracklet])
+    chosen = lines.pairs.of(concerned[lines.sights.tracklet])
     # If all are concerned, each meeting is counted for both of its tracklets.
     part = 0.5 if concerned.all() else 1.0
-    as_stated = stated.of(concerned)
+    as_stated = lines.stated.of(concerned)
     scores = []
     for each in tried:
-        nearest = _nearest_of(sights, chosen, each.r_km).of(concerned)
+        nearest = _nearest_of(lines.sights, chosen, each.r_km).of(concerned)
         gain = part * (nearest.log_odds() - as_stated.log_odds())
         scores.append((gain, nearest.share, each))
     scores.sort(key=lambda score: -score[0])
@@ -252,19 +269,16 @@ def _best(
     ]
 
 
-def _best_exchanges(
-    sights: Sights, pairs: _Pairs, stated: _Nearest, sensor_of: Integers, sensors: Sequence[int]
-) -> list[NamedReading]:
+def _best_exchanges(lines: _Lines, sensors: Sequence[int]) -> list[NamedReading]:
     """Return the exchanges of ephemerides that are clear, each of the `sensors` in one at most.
 
     Two sensors on one satellite share its ephemeris: either may be exchanged with a third.
     """
     found = []
-    tried = list(_exchanged(sights, sensors))
+    tried = list(_exchanged(lines.sights, sensors))
     for each in tried:
-        concerned = np.isin(sensor_of, [each.sensor, each.other])
-        others = stated.of(~concerned).share
-        found += _best(sights, pairs, [each], stated, concerned, others)
+        concerned = np.isin(lines.sensor_of, [each.sensor, each.other])
+        found += _best(lines, [each], concerned, lines.stated.of(~concerned).share)
     named: list[NamedReading] = []
     for one in sorted(found, key=lambda one: -one.log_odds):
         taken = {k for other in named for k in (other.sensor, other.other)}

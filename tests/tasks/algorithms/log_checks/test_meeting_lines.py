@@ -5,8 +5,7 @@ import pytest
 
 from epipole.tasks.algorithms.log_checks.meeting_lines import (
     Sights,
-    find_reading,
-    stated_meetings,
+    judge_meetings,
 )
 from epipole.tasks.algorithms.simulation.paths import state_at
 
@@ -69,6 +68,14 @@ def constellation(rng, n_satellites=12, n_common=12, n_others=40):
     sights = sights_of(rows)
     number, tracklet = (np.unique(each, return_inverse=True)[1] for each in sights[1:3])
     return sights._replace(sensor=number, tracklet=tracklet)
+
+
+def stated_meetings(sights):
+    return judge_meetings(sights, R_TEME)[0]
+
+
+def find_reading(sights, R):
+    return judge_meetings(sights, R)[1]
 
 
 def moved(sights, r_km, only=None):
