@@ -4,7 +4,6 @@ import logging
 from collections.abc import Iterable
 from typing import Any, NamedTuple
 
-import erfa
 import numpy as np
 import polars as pl
 
@@ -13,7 +12,7 @@ from epipole.schemas.arrays import Array
 from epipole.schemas.columns import POSITION
 from epipole.schemas.errors import DatasetError
 from epipole.schemas.rejects import NameStatus, Outcome
-from epipole.tasks.algorithms.times import utc_julian_date
+from epipole.tasks.algorithms.orbits.reference_frames import earth_fixed
 from epipole.tasks.report.frame_series import clock
 
 # Objects: where they are, how they move, and what is known of their names.
@@ -138,17 +137,12 @@ def _of_orbits(night: NightReader) -> Located:
 
 
 def _geography(rows: pl.DataFrame) -> list[Geography]:
-    """Return longitudes, latitudes and radii of positions.
-
-    UT1 is taken to be UTC: less than 0.004 degrees.
-    """
+    """Return longitudes, geocentric latitudes and radii of positions, see `earth_fixed`."""
     time_ns = rows["time"].dt.epoch("ns").to_numpy()
-    r = rows.select(POSITION).to_numpy()
+    r = earth_fixed(time_ns, rows.select(POSITION).to_numpy())
     radius = np.linalg.norm(r, axis=1)
     latitude = np.degrees(np.arcsin(r[:, 2] / radius))
-    ra = np.arctan2(r[:, 1], r[:, 0])
-    longitude = np.degrees(ra - erfa.era00(*utc_julian_date(time_ns)))
-    longitude = (longitude + 180.0) % 360.0 - 180.0
+    longitude = np.degrees(np.arctan2(r[:, 1], r[:, 0]))
     return list(zip(longitude.tolist(), latitude.tolist(), radius.tolist(), strict=True))
 
 
