@@ -389,7 +389,7 @@ def _measure_motions(
     n_of_nothing = int((of_state < 0).sum())
     real = (of_state >= 0) & ~np.isin(of_state, blended)
     if not real.any():
-        return {name: 0}
+        return {name: 0} | ({f"{name}_of_nothing": n_of_nothing} if n_of_nothing else {})
     states, of_state = states.filter(pa.array(real)), of_state[real]
     error = _state_errors(states, of_state, truth)
     nees = squared_normalised_errors(error, stack_covariance(states, "cov_{}", STATE_AXES))

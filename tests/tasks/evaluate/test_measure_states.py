@@ -49,5 +49,5 @@ def test_a_state_of_an_id_without_an_object_is_of_nothing():
     states = [little_state(name) for name in ("o1", "o2", "o3")]
     found = measure(matched(o1=[0], o2=[-1]), *states)
     assert (found["states"], found["states_of_nothing"]) == (1, 2)
-    assert measure(matched(o2=[-1]), *states) == {"states": 0}
+    assert measure(matched(o2=[-1]), *states) == {"states": 0, "states_of_nothing": 3}
     assert measure_states(empty(STATES), matched(o1=[0]), little_truth()) == {"states": 0}
