@@ -219,7 +219,8 @@ class Report:
         "observations",
         "recall",
         "share",
-        definition="The others, as a share of all centroids of true objects that have a position.",
+        definition="The others of true objects that have a position, as a share of all centroids "
+        "of these objects.",
     )
     observation_nees_mean: float | None = _measure(
         "observations",

@@ -276,10 +276,11 @@ def measure_observations(
     right = (shown >= 0) & (shown == of_id)
     found = matched.filter(pl.col("true_object") >= 0)["true_object"].unique()
     expected = points.filter((pl.col("kind") == OBJECT) & pl.col("source").is_in(found.implode()))
+    as_expected = right & np.isin(shown, found.to_numpy())
     measures = {
         "observations": len(rows),
         "observations_of_others": int(np.sum(~right)),
-        "observation_recall": share(float(np.sum(right)), expected.height),
+        "observation_recall": share(float(np.sum(as_expected)), expected.height),
     }
     right &= ~np.isin(shown, blended)
     if not right.any():

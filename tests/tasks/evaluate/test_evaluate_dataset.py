@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from scenes.little_night import little_dataset, little_state, little_truth, rows
 
-from epipole.schemas.bridge import empty
-from epipole.schemas.tables import STATES
+from epipole.schemas.bridge import concat, empty
+from epipole.schemas.tables import OBSERVATIONS, STATES
 from epipole.tasks.evaluate.evaluate_dataset import evaluate_dataset
 
 OF_PASSAGES = (
@@ -62,6 +62,23 @@ def test_an_empty_dataset_has_found_nothing():
     assert (found.att_wrong, found.tracks, found.nees_mean, found.states_in_99) == (None,) * 4
     assert found.id_swaps == 0
     json.dumps(found.as_dict(), allow_nan=False)
+
+
+def test_observations_of_objects_without_a_position_are_not_in_the_recall():
+    tables = little_dataset()
+    others = [
+        {"object_id": "o3", "sensor_id": s, "centroid": 2, "sigma_ra_arcsec": 1.0,
+         "sigma_dec_arcsec": 1.0}
+        for s in "ab"
+    ]  # fmt: skip
+    tables["observations"] = concat(
+        tables["observations"].schema, [tables["observations"], rows(OBSERVATIONS, *others)]
+    )
+    found = evaluate_dataset(tables, little_truth())
+    assert (found.observations, found.observations_of_others) == (4, 1)
+    assert found.observation_recall == 0.5
+    tables["positions"] = tables["positions"].slice(0, 0)
+    assert evaluate_dataset(tables, little_truth()).observation_recall == 0.0
 
 
 def test_without_objects_only_stars_and_attitudes_are_measured():
