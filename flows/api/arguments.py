@@ -129,9 +129,12 @@ def velocity(velocity_km_s: Any, default: float | None = None) -> Array:
     Raises
     ------
     ValueError
-        Where a log's velocity would be refused too: it may be in m/s.
+        Where it is not a number, or a log's velocity would be refused too: it may be in m/s.
     """
     v = floats("velocity_km_s", velocity_km_s, 3, default=default)
+    if velocity_km_s is not None and not np.isfinite(v).all():
+        unknown = "" if default is None else "; give None where it is unknown"
+        raise ValueError(f"velocity_km_s: is {v.tolist()}, expected numbers{unknown}")
     speed = float(np.linalg.norm(v))
     if speed > SPEED.maximum:
         raise ValueError(

@@ -234,7 +234,8 @@ def view_frame(
     ------
     ValueError
         Where a shape is wrong, a log with this camera would be refused, the attitude is not of
-        length 1, as where it is unknown, or `position_sigma_km` is not a number from 0 on.
+        length 1, as where it is unknown, the velocity is not known, or `position_sigma_km` is not
+        a number from 0 on.
 
     Examples
     --------

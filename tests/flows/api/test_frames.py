@@ -120,6 +120,8 @@ def test_an_empty_frame_is_no_error():
         ({"prior_sigma_arcsec": float("nan")}, "prior_sigma_arcsec: is nan, expected 0 or more"),
         ({"prior_sigma_arcsec": [3.0, 3.0]}, r"prior_sigma_arcsec: has shape \(2,\), expected"),
         ({"velocity_km_s": [7500.0, 0.0, 0.0]}, "velocity_km_s: 7500 km/s, .* is it in m/s"),
+        ({"velocity_km_s": [None] * 3}, "velocity_km_s: is .*; give None where it is unknown"),
+        ({"velocity_km_s": [7.5, np.nan, 0.0]}, "velocity_km_s: is .*, expected numbers"),
         ({"time": "noon"}, "time: "),
         ({"time": 2**70}, "time: "),
     ],
@@ -137,11 +139,12 @@ def test_a_view_without_an_attitude_is_an_error(attitude):
         api.view_frame([1.0], [1.0], camera=CAMERA, attitude_xyzw=attitude, sigma_px=0.1, **where)
 
 
-def test_a_view_needs_a_velocity():
+@pytest.mark.parametrize("velocity", [None, [None] * 3])
+def test_a_view_needs_a_velocity(velocity):
     with pytest.raises(ValueError, match="velocity_km_s"):
         api.view_frame(
             [1.0], [1.0], camera=CAMERA, attitude_xyzw=[0.0, 0.0, 0.0, 1.0], sigma_px=0.1,
-            position_km=[7000.0, 0.0, 0.0], velocity_km_s=None,
+            position_km=[7000.0, 0.0, 0.0], velocity_km_s=velocity,
         )  # fmt: skip
 
 
