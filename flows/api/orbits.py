@@ -128,13 +128,14 @@ def attributable(
     Returns
     -------
     Attributable
-        An epoch beyond the passage has errors that grow with the time.
+        An epoch beyond the passage has errors that grow with the time. Of one time only, rates and
+        covariance are NaN.
 
     Raises
     ------
     ValueError
-        Where arrays differ in length, are empty or have NaN, times are not in order, or a sigma
-        is not above 0.
+        Where arrays differ in length, are empty or have NaN, times are not in order or are
+        floats, or a sigma is not above 0.
 
     References
     ----------
@@ -157,6 +158,8 @@ def attributable(
     [0.62, 0.52, 0.16, 0.16]
     """
     times = np.atleast_1d(np.asarray(time))
+    if times.dtype.kind in "fb":  # seconds, it may be: as nanoseconds the rates would be nonsense
+        raise ValueError(f"time: is {times.dtype}, expected datetime64, or integers [ns]")
     times = times if times.dtype.kind == "M" else times.astype(NS)
     at_ns, n = nanoseconds("time", times), len(times)
     if not n or np.isnat(times).any() or (np.diff(at_ns) < 0).any():
@@ -177,10 +180,11 @@ def attributable(
         centroid_covariance(u, sigma),
     )  # fmt: skip
     east, north = east_north(fit.u)[0]
+    rate = np.where(np.isfinite(fit.cov[0]).all(), fit.w[0] / ARCSEC, np.nan)
     middle_ra, middle_dec = (float(np.degrees(angle[0])) for angle in radec_from_unit(fit.u))
     return Attributable(
         np.datetime64(epoch_ns, "ns"), middle_ra, middle_dec,
-        float(fit.w[0] @ east / ARCSEC), float(fit.w[0] @ north / ARCSEC), fit.cov[0] / ARCSEC**2,
+        float(rate @ east), float(rate @ north), fit.cov[0] / ARCSEC**2,
     )  # fmt: skip
 
 

@@ -48,6 +48,7 @@ def test_the_epoch_can_be_chosen_and_errors_given_one_by_one():
         ({"time": TIME[::-1]}, "not in order"),
         ({"time": TIME[:0]}, "no times"),
         ({"time": np.append(TIME[:-1], np.datetime64("NaT"))}, "or NaT"),
+        ({"time": np.arange(20.0)}, "time: is float64, expected datetime64, or integers"),
         ({"ra_deg": [1.0]}, r"ra_deg: has shape \(1,\), expected \(20,\)"),
         ({"dec_deg": np.append(np.ones(19), np.nan)}, "no numbers; leave them out"),
         ({"sigma_arcsec": 0.0}, "not above 0"),
@@ -58,6 +59,14 @@ def test_the_epoch_can_be_chosen_and_errors_given_one_by_one():
 def test_a_passage_that_cannot_be_used_is_an_error(other, says):
     with pytest.raises(ValueError, match=says):
         passage(**other)
+
+
+@pytest.mark.parametrize("n", [1, 4])
+def test_detections_of_one_time_have_no_rates(n):
+    found = api.attributable([TIME[0]] * n, [10.0] * n, [20.0] * n, 2.0)
+    assert (found.ra_deg, found.dec_deg) == pytest.approx((10.0, 20.0), abs=1e-3)
+    assert np.isnan([found.ra_rate_arcsec_s, found.dec_rate_arcsec_s]).all()
+    assert np.isnan(found.cov_arcsec2).all()
 
 
 def observations(truth, **other):
