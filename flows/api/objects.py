@@ -15,6 +15,8 @@ from epipole.tasks.algorithms.geometry.camera import Camera
 from epipole.tasks.algorithms.geometry.directions import matrix_from_quaternion
 from epipole.tasks.solve.associate_objects import associate_by_likelihood
 
+# [rad^2] added to variances of directions: 2e-7 arcsec. Lines without any error have no weights.
+LEAST_VARIANCE = 1e-24
 SPARSE = 100  # rows of a result per direction: with more, objects are not numbered from 0 on
 
 
@@ -109,8 +111,8 @@ def associate(views: Sequence[View], settings: Settings | None = None) -> FoundO
     Raises
     ------
     ValueError
-        Where a shape is wrong, a sigma is below 0, or a view has no attitude of length 1 or no
-        camera.
+        Where a shape is wrong, a sigma is below 0, a covariance is not one, or a view has no
+        attitude of length 1 or no camera.
 
     Notes
     -----
@@ -196,8 +198,9 @@ def triangulate(
     Raises
     ------
     ValueError
-        Where a shape is wrong, a sigma is below 0, an attitude is not of length 1, or numbers of
-        objects are not whole, or far above their count.
+        Where a shape is wrong, a sigma is below 0, a covariance is not one, `reject_sigma` is not
+        above 0, an attitude is not of length 1, or numbers of objects are not whole, or far above
+        their count.
 
     References
     ----------
@@ -229,6 +232,9 @@ def triangulate(
     counts = [len(view.u_icrs) for view in checked]
     r_km = np.repeat(np.reshape([view.position_km for view in checked], (-1, 3)), counts, axis=0)
     velocity = floats("velocity_km_s", velocity_km_s, g, 3, default=0.0)
+    limit = Settings().positions.reject_sigma if reject_sigma is None else reject_sigma
+    if not sigma("reject_sigma", limit) > 0.0:
+        raise ValueError("reject_sigma: is 0, expected more")
     found = triangulation.triangulate(
         np.searchsorted(labels[order], np.arange(g + 1)),
         r_km[order],
@@ -236,7 +242,7 @@ def triangulate(
         _joined([view.cov_rad2 for view in checked], 2, 2)[order],
         np.repeat([view.position_sigma_km for view in checked], counts)[order],
         velocity,
-        Settings().positions.reject_sigma if reject_sigma is None else reject_sigma,
+        limit,
     )
     used = np.zeros(len(labels), np.bool_)
     used[order] = found.used
@@ -252,12 +258,23 @@ def _checked(k: int, view: View) -> View:
     attitude = view.attitude_xyzw
     return View(
         u,
-        floats(name + "cov_rad2", view.cov_rad2, len(u), 2, 2, repeat=True),
+        _covariances(name + "cov_rad2", view.cov_rad2, len(u)),
         floats(name + "position_km", view.position_km, 3),
         sigma(name + "position_sigma_km", view.position_sigma_km),
         None if attitude is None else _attitude(name + "attitude_xyzw", attitude),
         None if view.camera is None else optics(name + "camera", view.camera),
     )
+
+
+def _covariances(name: str, values: npt.ArrayLike, n: int) -> Array:
+    cov = floats(name, values, n, 2, 2, repeat=True)
+    a, b, c = cov[:, 0, 0], cov[:, 0, 1], cov[:, 1, 1]
+    slack = 1e-9 * (a + c)  # rounding
+    ok = (a >= 0.0) & (c >= 0.0) & (a + c < np.inf) & (np.abs(b - cov[:, 1, 0]) <= slack)
+    ok &= a * c - b * b >= -slack * slack
+    if not ok.all():
+        raise ValueError(f"{name}: {cov[~ok][0].tolist()} is not a covariance")
+    return cov + LEAST_VARIANCE * np.eye(2)
 
 
 def _attitude(name: str, xyzw: npt.ArrayLike) -> Array:

@@ -69,6 +69,30 @@ def test_a_line_that_does_not_fit_is_left_out():
     assert [bool(used[0]) for used in found.used] == [False, True, True, True]
 
 
+@pytest.mark.parametrize("n_sensors", [2, 3, 4])
+def test_lines_without_error_meet_where_the_object_is(n_sensors):
+    views, there_km, _ = scene(3, n_sensors, n_objects=1)
+    lines = there_km[0] - [view.position_km for view in views]
+    u = lines / np.linalg.norm(lines, axis=1, keepdims=True)
+    exact = [
+        view._replace(u_icrs=u[k : k + 1], cov_rad2=np.zeros((2, 2)), position_sigma_km=0.0)
+        for k, view in enumerate(views)
+    ]
+    found = api.triangulate(exact)
+    np.testing.assert_allclose(found.r_gcrf_km, there_km, rtol=0.0, atol=1e-6)
+    assert np.sqrt(np.trace(found.cov_km2[0])) < 1e-5
+    assert np.concatenate(found.used).all()
+    if n_sensors > 2:
+        assert [of.tolist() for of in api.associate(exact).objects] == [[0]] * n_sensors
+
+
+@pytest.mark.parametrize("limit", [0.0, -3.0, np.nan])
+def test_a_limit_of_residuals_is_above_0(limit):
+    views, _, _ = scene(2, n_objects=1)
+    with pytest.raises(ValueError, match="reject_sigma: is "):
+        api.triangulate(views, reject_sigma=limit)
+
+
 def test_no_views_give_no_objects():
     assert api.associate([]).objects == []
     assert api.triangulate([], []).r_gcrf_km.shape == (0, 3)
@@ -80,6 +104,13 @@ def test_no_views_give_no_objects():
         ({"u_icrs": np.zeros((2, 2))}, r"views\[0\].u_icrs: has shape \(2, 2\), expected \(n, 3\)"),
         ({"u_icrs": np.ones((2, 3))}, r"views\[0\].u_icrs: are no unit vectors"),
         ({"cov_rad2": np.ones(3)}, r"views\[0\].cov_rad2: has shape \(3,\), expected \(8, 2, 2\)"),
+        (
+            {"cov_rad2": -np.eye(2)},
+            r"views\[0\].cov_rad2: \[\[-1.0, -0.0\], .* is not a covariance",
+        ),
+        ({"cov_rad2": np.full((2, 2), np.nan)}, r"views\[0\].cov_rad2: .* is not a covariance"),
+        ({"cov_rad2": [[1.0, 2.0], [2.0, 1.0]]}, r"views\[0\].cov_rad2: .* is not a covariance"),
+        ({"cov_rad2": [[1.0, 0.5], [0.0, 1.0]]}, r"views\[0\].cov_rad2: .* is not a covariance"),
         ({"position_km": [7e3]}, r"views\[0\].position_km: has shape \(1,\), expected \(3,\)"),
         ({"position_sigma_km": None}, r"views\[0\].position_sigma_km: is nan, expected 0 or"),
         ({"position_sigma_km": -0.05}, r"views\[0\].position_sigma_km: is -0.05, expected 0 or"),
