@@ -188,12 +188,12 @@ def attributable(
     )  # fmt: skip
 
 
-def link(tracklets: pl.DataFrame, settings: Settings | None = None) -> pl.Series:
+def link(tracklets: pl.DataFrame | pl.LazyFrame, settings: Settings | None = None) -> pl.Series:
     """Return which tracklets are one object by the orbit through them.
 
     Parameters
     ----------
-    tracklets : polars.DataFrame
+    tracklets : polars.DataFrame or polars.LazyFrame
         Rows like those of the table `tracklets`: attributables, with `start_time`, `end_time`,
         `sensor_id` and `track_id`. Rows with the same `object_id` (if there is such a column), and
         with the same track of a sensor, are one object before.
@@ -227,6 +227,7 @@ def link(tracklets: pl.DataFrame, settings: Settings | None = None) -> pl.Series
     (36, 0)
     """
     linking = (settings or Settings()).linking
+    tracklets = tracklets.lazy().collect()
     rows = tracklets.drop("row", strict=False).with_row_index("row")
     try:
         if "object_id" not in rows.columns:
@@ -248,12 +249,14 @@ def link(tracklets: pl.DataFrame, settings: Settings | None = None) -> pl.Series
     return found_of.replace_strict(first, pl.int_range(len(first), eager=True), default=None)
 
 
-def fit_orbit(observations: pl.DataFrame, start: npt.ArrayLike | None = None) -> ObjectOrbit:
+def fit_orbit(
+    observations: pl.DataFrame | pl.LazyFrame, start: npt.ArrayLike | None = None
+) -> ObjectOrbit:
     """Return the orbit of an object, fitted to observations of it.
 
     Parameters
     ----------
-    observations : polars.DataFrame
+    observations : polars.DataFrame or polars.LazyFrame
         Rows like those of the table `observations`, all of one object and of one night or two, in
         any order. `tracklet_id` and `object_id` are not needed.
     start : (6,) float, optional
@@ -283,6 +286,7 @@ def fit_orbit(observations: pl.DataFrame, start: npt.ArrayLike | None = None) ->
     >>> round(orbit.elements["a_km"], -3)
     42000.0
     """
+    observations = observations.lazy().collect()
     needed = [name for name in OBSERVED if name not in ("object_id", "tracklet_id")]
     if missing := [name for name in needed if name not in observations.columns]:
         raise ValueError(f"observations: has no column {', '.join(missing)}")

@@ -145,6 +145,13 @@ def test_numbers_that_no_fit_can_take_are_named():
             api.fit_orbit(rows, start)
 
 
+def test_tables_may_be_lazy_as_those_of_a_dataset_are():
+    rows = observations(GEO)
+    assert api.fit_orbit(rows.lazy()).chi2 == api.fit_orbit(rows).chi2
+    tracklets = pl.DataFrame(rows_of(orbit_tracklets(11, 6, 4, 60.0)))
+    assert api.link(tracklets.lazy()).to_list() == api.link(tracklets).to_list()
+
+
 def test_too_few_rows_give_no_orbit():
     orbit = api.fit_orbit(observations(GEO).head(3))
     assert orbit.verdict == "no_orbit"
