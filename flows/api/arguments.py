@@ -8,7 +8,7 @@ import numpy.typing as npt
 
 from epipole.io.logs.messages.cameras import optics_fault
 from epipole.schemas.arrays import Array, Integers
-from epipole.schemas.log_bounds import QUATERNION, SPEED
+from epipole.schemas.log_bounds import QUATERNION, SPEED, TIME
 from epipole.tasks.algorithms.geometry.camera import Camera
 
 Time = datetime.datetime | np.datetime64 | str | int
@@ -161,16 +161,27 @@ def nanoseconds(name: str, times: Any) -> npt.NDArray[np.int64]:
     return np.asarray(at_ns.astype(np.int64))
 
 
+def require_nanoseconds(name: str, lowest: int) -> None:
+    """Raise a ValueError where an integer of nanoseconds is before the times that a log may have.
+
+    Seconds, milliseconds and microseconds of our days are nanoseconds of 1970.
+    """
+    if lowest < TIME.minimum:
+        raise ValueError(f"{name}: {lowest} ns is before 1972, expected nanoseconds since 1970")
+
+
 def time_ns(time: Time) -> int:
     """Return a time as integer nanoseconds since 1970, UTC. A time without a zone is UTC.
 
     Raises
     ------
     ValueError
-        Where it is not a time.
+        Where it is not a time, or an integer of nanoseconds before 1972.
     """
     if isinstance(time, np.datetime64) and not np.isnat(time):
         return int(nanoseconds("time", time))
+    if isinstance(time, int | np.integer) and not isinstance(time, bool):
+        require_nanoseconds("time", int(time))
     try:
         if isinstance(time, int | np.integer) and not isinstance(time, bool):
             return int(np.int64(int(time)))

@@ -115,8 +115,8 @@ def identify_frame(
     Raises
     ------
     ValueError
-        Where arrays differ in length, a value is not a number, `prior_sigma_arcsec` is below 0, or
-        a log with this camera would be refused.
+        Where arrays differ in length, a value is not a number, an integer for the time is before
+        1972, `prior_sigma_arcsec` is below 0, or a log with this camera would be refused.
 
     Notes
     -----

@@ -6,7 +6,13 @@ import numpy as np
 import numpy.typing as npt
 import polars as pl
 
-from epipole.flows.api.arguments import Time, floats, nanoseconds, time_ns
+from epipole.flows.api.arguments import (
+    Time,
+    floats,
+    nanoseconds,
+    require_nanoseconds,
+    time_ns,
+)
 from epipole.schemas.arrays import Array, Flags
 from epipole.schemas.columns import ELEMENTS, POSITION
 from epipole.schemas.settings import Settings
@@ -134,8 +140,8 @@ def attributable(
     Raises
     ------
     ValueError
-        Where arrays differ in length, are empty or have NaN, times are not in order or are
-        floats, or a sigma is not above 0.
+        Where arrays differ in length, are empty or have NaN, times are not in order, are floats or
+        are integers of before 1972, or a sigma is not above 0.
 
     References
     ----------
@@ -160,6 +166,8 @@ def attributable(
     times = np.atleast_1d(np.asarray(time))
     if times.dtype.kind in "fb":  # seconds, it may be: as nanoseconds the rates would be nonsense
         raise ValueError(f"time: is {times.dtype}, expected datetime64, or integers [ns]")
+    if times.dtype.kind in "iu" and len(times):
+        require_nanoseconds("time", int(times.min()))
     times = times if times.dtype.kind == "M" else times.astype(NS)
     at_ns, n = nanoseconds("time", times), len(times)
     if not n or np.isnat(times).any() or (np.diff(at_ns) < 0).any():

@@ -33,6 +33,12 @@ def test_what_is_no_time_is_named(time):
         time_ns(time)
 
 
+@pytest.mark.parametrize("unit", [1, 1_000, 1_000_000])
+def test_integers_of_another_unit_than_nanoseconds_are_refused(unit):
+    with pytest.raises(ValueError, match=r"^time: .* ns is before 1972, expected nanoseconds"):
+        time_ns(NS // 1_000_000_000 * unit)
+
+
 def test_a_wrong_shape_is_one_clear_error():
     with pytest.raises(ValueError, match=r"^y_px: has shape \(3,\), expected \(4,\)$"):
         floats("y_px", [1, 2, 3], 4)

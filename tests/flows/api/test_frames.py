@@ -104,7 +104,7 @@ def test_a_prior_is_used_where_there_are_too_few_stars():
 
 
 def test_an_empty_frame_is_no_error():
-    found = api.identify_frame([], [], camera=CAMERA, time=0)
+    found = api.identify_frame([], [], camera=CAMERA, time="2019-04-01")
     assert (found.source, found.status, len(found.star_id)) == ("none", "no_centroids", 0)
 
 
@@ -127,7 +127,8 @@ def test_an_empty_frame_is_no_error():
     ],
 )
 def test_wrong_arguments_of_a_frame_are_named(change, message):
-    arguments = {"x_px": [1.0, 2.0], "y_px": [1.0, 2.0], "camera": CAMERA, "time": 0} | change
+    arguments = {"x_px": [1.0, 2.0], "y_px": [1.0, 2.0], "camera": CAMERA} | change
+    arguments = {"time": "2019-04-01"} | arguments
     with pytest.raises(ValueError, match=message):
         api.identify_frame(**arguments)
 

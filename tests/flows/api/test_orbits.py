@@ -49,6 +49,7 @@ def test_the_epoch_can_be_chosen_and_errors_given_one_by_one():
         ({"time": TIME[:0]}, "no times"),
         ({"time": np.append(TIME[:-1], np.datetime64("NaT"))}, "or NaT"),
         ({"time": np.arange(20.0)}, "time: is float64, expected datetime64, or integers"),
+        ({"time": np.arange(20) + 1_554_091_200}, "time: 1554091200 ns is before 1972, expected"),
         ({"ra_deg": [1.0]}, r"ra_deg: has shape \(1,\), expected \(20,\)"),
         ({"dec_deg": np.append(np.ones(19), np.nan)}, "no numbers; leave them out"),
         ({"sigma_arcsec": 0.0}, "not above 0"),
