@@ -123,6 +123,30 @@ def sigma(name: str, value: Any) -> float:
     return given
 
 
+# [km] No sensor is farther; a position above the ground in metres is.
+FARTHEST_KM = 5e6
+
+
+def position(name: str, position_km: Any) -> Array:
+    """Return a sensor's position (3,) [km].
+
+    Raises
+    ------
+    ValueError
+        Where it is not a number, or so far away that it may be in metres.
+    """
+    r = floats(name, position_km, 3)
+    if not np.isfinite(r).all():
+        raise ValueError(f"{name}: is {r.tolist()}, expected numbers")
+    distance = float(np.linalg.norm(r))
+    if distance > FARTHEST_KM:
+        raise ValueError(
+            f"{name}: {distance:.4g} km from the Earth's centre, expected at most "
+            f"{FARTHEST_KM:.4g}; is it in m?"
+        )
+    return r
+
+
 def velocity(velocity_km_s: Any, default: float | None = None) -> Array:
     """Return a sensor's velocity (3,) [km/s]; with `default`, None is that value.
 

@@ -10,6 +10,7 @@ from epipole.flows.api.arguments import (
     Time,
     floats,
     optics,
+    position,
     sigma,
     time_ns,
     unit_quaternion,
@@ -234,8 +235,8 @@ def view_frame(
     ------
     ValueError
         Where a shape is wrong, a log with this camera would be refused, the attitude is not of
-        length 1, as where it is unknown, the velocity is not known, or `position_sigma_km` is not
-        a number from 0 on.
+        length 1, as where it is unknown, position or velocity are not known or may be in metres,
+        or `position_sigma_km` is not a number from 0 on.
 
     Examples
     --------
@@ -263,7 +264,7 @@ def view_frame(
     return View(
         u_icrs,
         on_tangent_plane(u_icrs, cov),
-        floats("position_km", position_km, 3),
+        position("position_km", position_km),
         sigma("position_sigma_km", position_sigma_km),
         attitude,
         camera,

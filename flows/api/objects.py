@@ -6,7 +6,14 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from epipole.flows.api.arguments import floats, integers, optics, sigma, unit_quaternion
+from epipole.flows.api.arguments import (
+    floats,
+    integers,
+    optics,
+    position,
+    sigma,
+    unit_quaternion,
+)
 from epipole.schemas.arrays import Array, Flags, Indices
 from epipole.schemas.settings import Settings
 from epipole.tasks.algorithms.association.samples import Samples
@@ -111,8 +118,8 @@ def associate(views: Sequence[View], settings: Settings | None = None) -> FoundO
     Raises
     ------
     ValueError
-        Where a shape is wrong, a sigma is below 0, a covariance is not one, or a view has no
-        attitude of length 1 or no camera.
+        Where a shape is wrong, a sigma is below 0, a covariance is not one, a position is not known
+        or may be in metres, or a view has no attitude of length 1 or no camera.
 
     Notes
     -----
@@ -198,9 +205,9 @@ def triangulate(
     Raises
     ------
     ValueError
-        Where a shape is wrong, a sigma is below 0, a covariance is not one, `reject_sigma` is not
-        above 0, an attitude is not of length 1, or numbers of objects are not whole, or far above
-        their count.
+        Where a shape is wrong, a sigma is below 0, a covariance is not one, a position is not known
+        or may be in metres, `reject_sigma` is not above 0, an attitude is not of length 1, or
+        numbers of objects are not whole, or far above their count.
 
     References
     ----------
@@ -259,7 +266,7 @@ def _checked(k: int, view: View) -> View:
     return View(
         u,
         _covariances(name + "cov_rad2", view.cov_rad2, len(u)),
-        floats(name + "position_km", view.position_km, 3),
+        position(name + "position_km", view.position_km),
         sigma(name + "position_sigma_km", view.position_sigma_km),
         None if attitude is None else _attitude(name + "attitude_xyzw", attitude),
         None if view.camera is None else optics(name + "camera", view.camera),

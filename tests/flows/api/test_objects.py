@@ -112,6 +112,8 @@ def test_no_views_give_no_objects():
         ({"cov_rad2": [[1.0, 2.0], [2.0, 1.0]]}, r"views\[0\].cov_rad2: .* is not a covariance"),
         ({"cov_rad2": [[1.0, 0.5], [0.0, 1.0]]}, r"views\[0\].cov_rad2: .* is not a covariance"),
         ({"position_km": [7e3]}, r"views\[0\].position_km: has shape \(1,\), expected \(3,\)"),
+        ({"position_km": [7e6, 0.0, 0.0]}, r"position_km: 7e\+06 km from .*; is it in m\?"),
+        ({"position_km": [np.nan] * 3}, r"views\[0\].position_km: is .*, expected numbers"),
         ({"position_sigma_km": None}, r"views\[0\].position_sigma_km: is nan, expected 0 or"),
         ({"position_sigma_km": -0.05}, r"views\[0\].position_sigma_km: is -0.05, expected 0 or"),
         ({"attitude_xyzw": np.full(4, np.nan)}, r"views\[0\].attitude_xyzw: has length nan"),
