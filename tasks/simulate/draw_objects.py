@@ -43,6 +43,7 @@ from epipole.tasks.algorithms.simulation.sources import SimulatedObjects
 # Orbits: elements, positions, random ones, and objects near them.
 
 
+RADIAL = 1e-6  # [km/s] a velocity with a smaller part across falls to the centre of the Earth
 NO_SENSOR = 1_000_000  # first index of the random streams that belong to no sensor
 
 
@@ -56,6 +57,8 @@ def draw_elements(orbit: Orbit, rng: np.random.Generator) -> Array:
         v_km_s = circular_velocity(r_km) if v is None else np.array(v)
         if v_km_s @ v_km_s >= 2 * GM_KM3_S2 / np.linalg.norm(r_km):
             raise SceneError(f"velocity_km_s {v}: faster than escape velocity")
+        if np.linalg.norm(np.cross(r_km, v_km_s)) < RADIAL * np.linalg.norm(r_km):
+            raise SceneError(f"velocity_km_s {v}: straight up or down; an orbit goes across too")
         return elements_from_state(r_km, v_km_s)
     angles = np.radians([orbit.i_deg, orbit.raan_deg, orbit.argp_deg])
     if orbit.true_anomaly_deg is not None:

@@ -53,10 +53,14 @@ def test_a_scene_that_cannot_be_simulated_is_refused():
     two = scene_of(sensors=[SENSOR | {"id": "a", "count": 2}, SENSOR | {"id": "a1"}])
     with pytest.raises(SceneError, match="two sensors would be called a1"):
         stage.simulate_scene(two)
-    away = {"position_km": (7000.0, 0.0, 0.0), "velocity_km_s": (0.0, 12.0, 0.0)}
-    away = scene_of({"orbit": away})
-    with pytest.raises(SceneError, match="faster than escape velocity"):
-        stage.simulate_scene(away)
+    for v_km_s, why in (
+        ((0.0, 12.0, 0.0), "faster than escape velocity"),
+        ((0.0, 0.0, 0.0), "straight up or down"),
+        ((-1.0, 0.0, 0.0), "straight up or down"),
+    ):
+        away = {"position_km": (7000.0, 0.0, 0.0), "velocity_km_s": v_km_s}
+        with pytest.raises(SceneError, match=why):
+            stage.simulate_scene(scene_of({"orbit": away}))
 
 
 def test_nothing_is_seen_through_the_earth():
