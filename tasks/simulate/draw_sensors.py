@@ -14,6 +14,7 @@ from epipole.schemas.scene import Scene, SceneCamera, SceneSensor
 from epipole.schemas.star_lists import ElementSet
 from epipole.tasks.algorithms.simulation.constants import ARCSEC
 from epipole.tasks.algorithms.simulation.element_sets import directions_to_sun
+from epipole.tasks.algorithms.simulation.exposures import SATELLITE_RADIUS_KM
 from epipole.tasks.algorithms.simulation.optics import TrueOptics, hidden_by_earth
 from epipole.tasks.algorithms.simulation.paths import Paths, resting_path, two_body_paths
 from epipole.tasks.algorithms.simulation.sensor import (
@@ -86,7 +87,21 @@ def draw_sensors(scene: Scene, t0_ns: int, objects: DrawnObjects) -> list[DrawnS
             drawn += _near_orbits(scene, group, t0_ns, objects, len(drawn))
         else:
             drawn += _on_satellites(scene, group, t0_ns, objects, len(drawn))
+    for each in drawn:
+        _require_apart(scene, each.sensor)
     return drawn
+
+
+def _require_apart(scene: Scene, sensor: SimulatedSensor) -> None:
+    """Raise where a sensor tracks the satellite that carries it."""
+    if sensor.followed is None:
+        return
+    start = np.zeros(1)
+    apart_km = np.linalg.norm(sensor.followed.at(start)[0] - sensor.path.at(start)[0])
+    if apart_km < SATELLITE_RADIUS_KM:
+        raise SceneError(
+            f"{scene.name}: sensor {sensor.sensor_id} tracks the satellite that carries it"
+        )
 
 
 def _near_orbits(
@@ -208,11 +223,16 @@ def _two_body_path(
 
 
 def _sees(scene: Scene, path: Paths, followed: Paths) -> bool:
-    """Return whether the Earth is never between a sensor and what it tracks."""
+    """Return whether the Earth is never between a sensor and what it tracks.
+
+    A sensor does not see the satellite that carries it.
+    """
     t_s = np.linspace(0, scene.duration_s, 2 + int(scene.duration_s / 60))
     r_km, _ = path.at(t_s)
     d = followed.at(t_s)[0] - r_km
     distance = np.linalg.norm(d, axis=1)
+    if distance.min() < SATELLITE_RADIUS_KM:
+        return False
     return not hidden_by_earth(r_km, d / distance[:, None], distance).any()
 
 

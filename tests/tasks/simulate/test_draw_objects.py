@@ -111,6 +111,16 @@ def test_a_sensor_does_not_see_the_satellite_that_carries_it(file):
     assert set(seen.source[seen.kind == 1].tolist()) == {3}
 
 
+def test_a_sensor_does_not_track_the_satellite_that_carries_it(file):
+    sensor = {"orbit": {"elements": file}, "pointing": {"mode": "track", "target": "BETA 2"}}
+    targets = [{"orbit": {"elements": file}, "magnitude": 5.0}]
+    with pytest.raises(SceneError, match="sensor a4 tracks the satellite that carries it"):
+        simulate_scene(scene_of(sensor, start=START, targets=targets))
+    alone = {"orbit": {"elements": file, "satellites": [13]}, "in_view": True}
+    with pytest.raises(SceneError, match=r"1 satellites are wanted of 1 .* visible; found 0"):
+        simulate_scene(scene_of(sensor | alone, start=START, targets=targets))
+
+
 def test_an_object_to_track_is_found_by_name_or_number_or_named(file):
     targets = [{"orbit": {"elements": file}, "magnitude": 5.0}]
     for target in ("alpha", "11", 1):
