@@ -444,10 +444,10 @@ class Scene(Group):
     """A scene to simulate."""
 
     name: str = Field(pattern=_NAME)
-    # The times of MCAP are unsigned, those of tables end in 2262.
+    # Those of `log_bounds`, with room for the states about a scene of a month.
     start: Annotated[
         AwareDatetime,
-        Field(ge=datetime(1970, 1, 2, tzinfo=UTC), lt=datetime(2262, 1, 1, tzinfo=UTC)),
+        Field(ge=datetime(1972, 1, 2, tzinfo=UTC), lt=datetime(2099, 11, 1, tzinfo=UTC)),
     ] = datetime(2019, 4, 1, 4, tzinfo=UTC)
     duration_s: float = Field(60.0, gt=0, le=31 * 86400)
     seed: int = Field(1, ge=0)

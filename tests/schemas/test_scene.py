@@ -42,6 +42,12 @@ def test_a_bad_scene_is_one_line_that_names_the_field(says):
     assert "\n" not in str(error.value)
 
 
+@pytest.mark.parametrize("start", ["1971-12-31T12:00:00Z", "2150-01-01T00:00:00Z"])
+def test_a_scene_starts_where_the_times_of_a_log_may_be(start):
+    with pytest.raises(SceneError, match=r"start = .*: input should be"):
+        scene_of({}, start=start)
+
+
 @pytest.mark.parametrize(
     ("says", "target"),
     [
