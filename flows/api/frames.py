@@ -236,7 +236,7 @@ def view_frame(
     ValueError
         Where a shape is wrong, a log with this camera would be refused, the attitude is not of
         length 1, as where it is unknown, position or velocity are not known or may be in metres,
-        or `position_sigma_km` is not a number from 0 on.
+        or `sigma_px` or `position_sigma_km` are not numbers from 0 on.
 
     Examples
     --------
@@ -253,7 +253,10 @@ def view_frame(
     n = len(x)
     camera = optics("camera", camera)
     u = unproject(camera, x, floats("y_px", y_px, n))
-    sigma_rad = floats("sigma_px", sigma_px, n, repeat=True) * pixel_angle(camera, u)
+    errors_px = floats("sigma_px", sigma_px, n, repeat=True)
+    if not (errors_px >= 0.0).all():
+        raise ValueError("sigma_px: has values that are below 0, or no numbers")
+    sigma_rad = errors_px * pixel_angle(camera, u)
     attitude = unit_quaternion("attitude_xyzw", floats("attitude_xyzw", attitude_xyzw, 4))
     R = matrix_from_quaternion(attitude[None])[0]
     apparent = u @ R

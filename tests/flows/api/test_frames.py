@@ -149,6 +149,15 @@ def test_a_view_needs_a_velocity(velocity):
         )  # fmt: skip
 
 
+@pytest.mark.parametrize("sigma_px", [-0.1, [0.1, None]])
+def test_a_view_needs_errors_of_its_centroids(sigma_px):
+    with pytest.raises(ValueError, match="sigma_px: has values that are below 0, or no numbers"):
+        api.view_frame(
+            [1.0, 2.0], [1.0, 2.0], camera=CAMERA, attitude_xyzw=[0.0, 0.0, 0.0, 1.0],
+            sigma_px=sigma_px, position_km=[7000.0, 0.0, 0.0], velocity_km_s=[0.0, 7.5, 0.0],
+        )  # fmt: skip
+
+
 def test_directions_come_back_with_the_scatter_of_their_covariance():
     rng = np.random.default_rng(5)
     q = np.array([0.3, -0.2, 0.5, 0.78])
