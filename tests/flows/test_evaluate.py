@@ -40,9 +40,14 @@ def reference():
 
 
 def compare(expected, found):
-    """Require the same measures, number for number. A measure that is not there is null."""
+    """Require the same measures, number for number. A measure that is not there is null.
+
+    The other tool has fewer of orbits, and of some logs none.
+    """
     assert set(expected) <= set(found)
     for name, value in found.items():
+        if name.startswith("orbits") and name not in expected:
+            continue
         other = expected.get(name)
         if isinstance(other, float) and not np.isfinite(other):  # JSON has no infinity
             other = None
@@ -90,6 +95,8 @@ def spoil(dataset: Path, share: float) -> None:
             case "states":
                 t = change(mix(t, "object_id"), "cov_vxvx", lambda v: -v)
                 t = change(t, "object_id", lambda _: "another")
+                t = whole_microseconds(t, "epoch")
+            case "orbits":
                 t = whole_microseconds(t, "epoch")
         pq.write_table(t, part)
 
