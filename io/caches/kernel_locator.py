@@ -1,12 +1,19 @@
-"""Where numba looks for a kernel of this package: in the folder of its module."""
+"""Where numba looks for a kernel of this package, and what it compiles for and names it.
+
+A kernel is in the folder of its module.
+"""
 
 import contextlib
+import functools
+import itertools
 import os
+import secrets
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numba
+from numba.core.bytecode import FunctionIdentity
 from numba.core.caching import CacheImpl, _CacheLocator
 
 _FolderOf = Callable[[str], Path | None]
@@ -58,3 +65,20 @@ def use_target(name: str) -> None:
     """
     numba.config.CPU_NAME = name  # type: ignore[attr-defined]
     numba.config.CPU_FEATURES = ""  # type: ignore[attr-defined]
+
+
+@functools.cache
+def name_uniquely() -> None:
+    """Give the functions that this process compiles names that no other process gives.
+
+    numba numbers functions from 1 in each process. The number is all that distinguishes inner
+    functions of one name and type, such as those of `np.sort` and `np.argsort`. But kernels that
+    several processes have compiled are loaded into one, and of two functions of one name the linker
+    takes the first for both: a kernel's `np.argsort` returned sorted values.
+    """
+    _number_from_anywhere()
+    os.register_at_fork(after_in_child=_number_from_anywhere)
+
+
+def _number_from_anywhere() -> None:
+    FunctionIdentity._unique_ids = itertools.count(2**32 + secrets.randbits(60))

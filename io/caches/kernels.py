@@ -30,6 +30,7 @@ _ROOT = Path(__file__).parents[2]  # of the package
 COMPILED = Path(__file__).parent / "compiled"  # of a wheel; a checkout lacks it
 # The folder of a process, for those that it starts: a temporary one is shared with them.
 HANDED_ON = "EPIPOLE_KERNELS"
+NAMING = 2  # of functions in kernels: those of another naming are not used
 KEPT = 400  # folders of modules: those of seven versions that differ in all of them
 
 _IMPORT = re.compile(
@@ -49,14 +50,15 @@ def use_kernel_cache() -> None:
     Called before any kernel is declared: numba then decides where it is kept.
     """
     global _folder
+    # Imports numba: as late as possible.
+    from epipole.io.caches.kernel_locator import locate_kernels, name_uniquely, use_target
+
+    name_uniquely()
     given = os.environ.get(HANDED_ON)
     is_given = bool(given) and Path(str(given)).is_dir()
     named = os.environ.get("NUMBA_CACHE_DIR")
     if not is_given and named and _is_writable(Path(named)):
         return
-    # Imports numba: as late as possible.
-    from epipole.io.caches.kernel_locator import locate_kernels, use_target
-
     target = common_target()
     if target is not None:
         use_target(target)
@@ -84,7 +86,7 @@ def folder_of(module: str) -> Path | None:
 @functools.cache  # asked for each kernel of a module
 def digest_of(module: str, root: Path = _ROOT) -> str:
     """Return the digest of a module, of all modules that it imports, and of numba's version."""
-    digest = hashlib.sha256(importlib.metadata.version("numba").encode())
+    digest = hashlib.sha256(f"{importlib.metadata.version('numba')} {NAMING}".encode())
     for name in sorted(imported_by(module, root)):
         digest.update(name.encode() + b"\0" + _source(name, root).encode())
     return digest.hexdigest()[:16]

@@ -1,6 +1,8 @@
 """Compiled kernels are kept apart for other code, and those of a wheel are used."""
 
 import os
+import subprocess
+import sys
 import time
 from types import SimpleNamespace
 
@@ -90,6 +92,50 @@ def test_a_started_process_uses_the_folder_of_the_one_that_started_it(tmp_path, 
     folder.rmdir()  # the one that started it is gone, and with it a temporary folder
     use_kernel_cache()
     assert kernel_folder() == tmp_path / "other" / "kernels"
+
+
+SORTING = """
+import numpy as np
+from numba import njit
+
+@njit(cache=True)
+def sort(x):
+    return np.{}(x)
+"""
+# With three functions before it, numba 0.68 gives the inner function of `np.argsort` the number
+# that the one of `np.sort` has in another process.
+BEFORE = "from numba import njit; [njit(lambda: 1)() for _ in range(3)]"
+
+
+def test_kernels_of_two_processes_are_not_taken_for_each_other(tmp_path):
+    for name in ("sort", "argsort"):
+        (tmp_path / f"{name}_of.py").write_text(SORTING.format(name))
+    environment = os.environ | {"NUMBA_CACHE_DIR": str(tmp_path / "kernels")}
+
+    def sorted_by(*names, before=""):
+        lines = ["import epipole.tasks, numpy as np", before]
+        lines += [f"from {n}_of import sort; print(*sort(np.array([3.0, 1, 2])))" for n in names]
+        command = [sys.executable, "-c", "\n".join(lines)]
+        done = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True,
+                              check=True, text=True)  # fmt: skip
+        return done.stdout.splitlines()
+
+    assert sorted_by("sort") == ["1.0 2.0 3.0"]
+    assert sorted_by("argsort", before=BEFORE) == ["1 2 0"]
+    assert sorted_by("sort", "argsort") == ["1.0 2.0 3.0", "1 2 0"]
+
+
+def test_forked_processes_name_functions_apart():
+    script = (
+        "import multiprocessing as m, epipole.tasks\n"
+        "from numba.core.bytecode import FunctionIdentity as identity\n"
+        "number = lambda _: next(identity._unique_ids) >> 16\n"
+        "def of(k): return number(k)\n"
+        "with m.get_context('fork').Pool(1) as a, m.get_context('fork').Pool(1) as b:\n"
+        "    print(number(0), *a.map(of, [0]), *b.map(of, [0]))\n"
+    )
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, check=True)
+    assert len(set(done.stdout.split())) == 3
 
 
 def test_a_users_own_folder_wins(monkeypatch, tmp_path):
