@@ -127,6 +127,11 @@ def sigma(name: str, value: Any) -> float:
 FARTHEST_KM = 5e6
 
 
+def _require_numbers(name: str, values: Array, hint: str = "") -> None:
+    if not np.isfinite(values).all():
+        raise ValueError(f"{name}: is {values.tolist()}, expected numbers{hint}")
+
+
 def position(name: str, position_km: Any) -> Array:
     """Return a sensor's position (3,) [km].
 
@@ -136,8 +141,7 @@ def position(name: str, position_km: Any) -> Array:
         Where it is not a number, or so far away that it may be in metres.
     """
     r = floats(name, position_km, 3)
-    if not np.isfinite(r).all():
-        raise ValueError(f"{name}: is {r.tolist()}, expected numbers")
+    _require_numbers(name, r)
     distance = float(np.linalg.norm(r))
     if distance > FARTHEST_KM:
         raise ValueError(
@@ -156,9 +160,9 @@ def velocity(velocity_km_s: Any, default: float | None = None) -> Array:
         Where it is not a number, or a log's velocity would be refused too: it may be in m/s.
     """
     v = floats("velocity_km_s", velocity_km_s, 3, default=default)
-    if velocity_km_s is not None and not np.isfinite(v).all():
-        unknown = "" if default is None else "; give None where it is unknown"
-        raise ValueError(f"velocity_km_s: is {v.tolist()}, expected numbers{unknown}")
+    if velocity_km_s is not None:
+        hint = "" if default is None else "; give None where it is unknown"
+        _require_numbers("velocity_km_s", v, hint)
     speed = float(np.linalg.norm(v))
     if speed > SPEED.maximum:
         raise ValueError(

@@ -7,12 +7,13 @@ from typing import Any, NamedTuple
 import numpy as np
 import polars as pl
 
+from epipole.io.catalogues.earth_orientation import read_earth_orientation
 from epipole.io.datasets.night_tables import NightReader
 from epipole.schemas.arrays import Array
 from epipole.schemas.columns import POSITION
 from epipole.schemas.errors import DatasetError
 from epipole.schemas.rejects import NameStatus, Outcome
-from epipole.tasks.algorithms.orbits.reference_frames import earth_fixed
+from epipole.tasks.algorithms.orbits.reference_frames import from_gcrf, orientation_at
 from epipole.tasks.report.frame_series import clock
 
 # Objects: where they are, how they move, and what is known of their names.
@@ -137,9 +138,11 @@ def _of_orbits(night: NightReader) -> Located:
 
 
 def _geography(rows: pl.DataFrame) -> list[Geography]:
-    """Return longitudes, geocentric latitudes and radii of positions, see `earth_fixed`."""
+    """Return longitudes, geocentric latitudes and radii of positions."""
     time_ns = rows["time"].dt.epoch("ns").to_numpy()
-    r = earth_fixed(time_ns, rows.select(POSITION).to_numpy())
+    orientation = orientation_at(time_ns, *read_earth_orientation())
+    R = from_gcrf("ITRF", time_ns, orientation)[:, :3, :3]
+    r = np.einsum("nij,nj->ni", R, rows.select(POSITION).to_numpy())
     radius = np.linalg.norm(r, axis=1)
     latitude = np.degrees(np.arcsin(r[:, 2] / radius))
     longitude = np.degrees(np.arctan2(r[:, 1], r[:, 0]))

@@ -180,16 +180,6 @@ def from_gcrf(frame: str, time_ns: Nanoseconds, orientation: Orientation) -> Arr
     return turn
 
 
-def earth_fixed(time_ns: Nanoseconds, r_km: Array) -> Array:
-    """Return GCRF positions (n, 3) at UTC times (n,) in axes that turn with the Earth.
-
-    UT1 is taken to be UTC, and the pole of the rotation to be that of the Earth's crust: together
-    less than 0.004 degrees.
-    """
-    utc, zero = utc_julian_date(time_ns), np.zeros(len(time_ns))
-    return _rotate(_tirs_from_gcrf(time_ns, Orientation(utc, zero, zero, zero)), r_km)
-
-
 def _tirs_from_gcrf(time_ns: Nanoseconds, orientation: Orientation) -> Array:
     """Return (n, 3, 3): Earth's rotation, precession and nutation, without polar motion."""
     return _about_z(erfa.era00(*orientation.ut1)) @ _cirs_from_gcrf(time_ns)

@@ -43,7 +43,7 @@ def test_tasks_have_about_equal_work():
     work = [
         sum(n_frames[k] + OF_PIECE for k in batch) for batch in in_batches(range(10_000), n_frames)
     ]
-    assert max(work) - min(work) <= 800 + 2 * OF_PIECE
+    assert max(work) - min(work) <= 800
     assert sum(work) / len(work) <= FRAMES_OF_TASK
 
 
