@@ -414,7 +414,8 @@ _OPTICS = [
 
 CALIBRATIONS = schema(
     "calibrations",
-    "One row per sensor: its optics, fitted to its stars of the night.",
+    "One row per sensor: its optics, fitted to its stars of the night; of several calibrations the "
+    "one with most stars.",
     [
         SENSOR_ID,
         *[column(name, F64, unit=unit, doc=doc) for name, unit, doc in _OPTICS],

@@ -12,7 +12,7 @@ import numpy as np
 import pyarrow as pa
 
 from epipole.io.work.parts import Parts
-from epipole.schemas.arrays import Array
+from epipole.schemas.arrays import Array, Integers
 from epipole.schemas.bridge import (
     array,
     concat,
@@ -56,8 +56,8 @@ class Calibrated(NamedTuple):
     """Fitted optics.
 
     calibrations : CALIBRATIONS, a row per sensor with enough stars
-    cameras : CAMERAS, with the fitted optics and their covariance for the sensors in `departed`
-    departed : sensors whose optics certainly differ from their calibration
+    cameras : CAMERAS, with the fitted optics and their covariance where they certainly differ
+    departed : sensors with such optics
     """
 
     calibrations: pa.Table
@@ -123,46 +123,52 @@ def calibrate_sensors(
 ) -> Calibrated:
     """Return the optics that fit the stars.
 
+    Each calibration of a sensor is fitted to the stars of the frames for which it holds. The row of
+    a sensor is that of the calibration with most stars.
+
     Parameters
     ----------
     stars
         STARS; those of a sensor are in order of time.
     cameras, nominal
-        CAMERAS with which the stars were identified, and those of the log.
+        CAMERAS with which the stars were identified, and those of the log, row by row; the rows of
+        a sensor are in order of time.
     principal_point_px
         1-sigma error of the log's principal points, per axis; None: unknown, and taken as 0 where
         the stars do not contradict the log.
     """
-    rows, changed = [], {}
-    logged = _single(nominal)
-    for name, optics in _single(cameras).items():
-        images = _images(rows_with(stars, "sensor_id", name), optics.camera)
-        logged_optics = logged.get(name, optics)
-        present = _Present(optics.camera, optics.cov != logged_optics.cov)
-        fitted = _fit(NominalOptics(logged_optics.camera, principal_point_px), present, images)
-        if fitted is None:
-            continue
-        fit, departs = fitted
-        rows.append(_row(name, fit))
-        if departs:
-            changed[name] = fit.camera._asdict() | _covariance_columns(fit.cov)
-        LOGGER.debug("%s: optics from %d stars, rms %.3f px", name, fit.n_stars, fit.residual_px)
+    rows, changed, departed = [], dict[int, dict[str, Any]](), set[str]()
+    for name in dict.fromkeys(cameras["sensor_id"].to_pylist()):
+        fits = []
+        for of_sensor in _calibrations(cameras, nominal, name):
+            images = _images(of_sensor.choose(rows_with(stars, "sensor_id", name)),
+                             of_sensor.present.camera)  # fmt: skip
+            given = NominalOptics(of_sensor.logged, principal_point_px)
+            fitted = _fit(given, of_sensor.present, images)
+            if fitted is None:
+                continue
+            fit, departs = fitted
+            fits.append(fit)
+            if departs:
+                values = fit.camera._asdict() | _covariance_columns(fit.cov)
+                changed |= dict.fromkeys(of_sensor.rows, values)
+                departed.add(name)
+            LOGGER.debug(
+                "%s: optics from %d stars, rms %.3f px", name, fit.n_stars, fit.residual_px
+            )
+        if fits:
+            rows.append(_row(name, max(fits, key=lambda fit: fit.n_stars)))
     return Calibrated(
         concat(CALIBRATIONS, rows) if rows else empty(CALIBRATIONS),
         with_optics(cameras, changed),
-        sorted(changed),
+        sorted(departed),
     )
 
 
-def with_optics(cameras: pa.Table, changed: Mapping[str, dict[str, Any]]) -> pa.Table:
-    """Return CAMERAS with other values for some sensors."""
-    rows = [row | changed.get(row["sensor_id"], {}) for row in rows_of(cameras)]
+def with_optics(cameras: pa.Table, changed: Mapping[int, dict[str, Any]]) -> pa.Table:
+    """Return CAMERAS with other values in some rows."""
+    rows = [row | changed.get(k, {}) for k, row in enumerate(rows_of(cameras))]
     return pa.Table.from_pylist(rows, schema=CAMERAS)
-
-
-class _Optics(NamedTuple):
-    camera: Camera
-    cov: bytes
 
 
 class _Present(NamedTuple):
@@ -170,16 +176,41 @@ class _Present(NamedTuple):
     is_fitted: bool  # its covariance is not that of the log
 
 
-def _single(cameras: pa.Table) -> dict[str, _Optics]:
-    """Return the optics of sensors with one calibration.
+class _Calibration(NamedTuple):
+    """One calibration of a sensor.
 
-    With two calibrations, it is not known which of them a star was identified with.
+    rows : its rows in CAMERAS, several where it holds again after another one
+    logged : the camera of the log
+    present : the camera with which the stars were identified
+    newest : (calibrations, 2) the time from which each of the sensor holds [ns], and its row
     """
-    found: dict[str, set[_Optics]] = {}
-    for k, name in enumerate(cameras["sensor_id"].to_pylist()):
-        optics = _Optics(camera_of(cameras, k), optics_covariance_of(cameras, k).tobytes())
-        found.setdefault(name, set()).add(optics)
-    return {name: optics.pop() for name, optics in found.items() if len(optics) == 1}
+
+    rows: list[int]
+    logged: Camera
+    present: _Present
+    newest: Integers
+
+    def choose(self, stars: pa.Table) -> pa.Table:
+        """Return the stars of the sensor that were identified with this calibration."""
+        if len(self.rows) == len(self.newest):
+            return stars
+        time_ns, row = self.newest.T
+        at = np.searchsorted(time_ns, array(stars, "time"), side="right") - 1
+        # The first one also holds before its time.
+        return stars.filter(pa.array(np.isin(row[np.maximum(at, 0)], self.rows)))
+
+
+def _calibrations(cameras: pa.Table, nominal: pa.Table, sensor_id: str) -> list[_Calibration]:
+    """Return the calibrations of a sensor that differ."""
+    rows = np.flatnonzero(np.asarray(cameras["sensor_id"]) == sensor_id).tolist()
+    newest = np.column_stack([array(cameras, "time")[rows], rows])
+    found: dict[tuple[Any, ...], _Calibration] = {}
+    for k in rows:
+        present, logged = camera_of(cameras, k), camera_of(nominal, k)
+        cov, logged_cov = (optics_covariance_of(t, k).tobytes() for t in (cameras, nominal))
+        one = _Calibration([], logged, _Present(present, cov != logged_cov), newest)
+        found.setdefault((present, logged, cov, logged_cov), one).rows.append(k)
+    return list(found.values())
 
 
 def _images(stars: pa.Table, camera: Camera) -> StarImages:

@@ -89,7 +89,7 @@ class CameraFinding(NamedTuple):
     def cameras(self, nominal: pa.Table, camera: Camera) -> pa.Table:
         """Return the sensor's rows of CAMERAS with this camera."""
         of_sensor = rows_with(nominal, "sensor_id", self.sensor_id)
-        return with_optics(of_sensor, {self.sensor_id: camera._asdict()})
+        return with_optics(of_sensor, dict.fromkeys(range(of_sensor.num_rows), camera._asdict()))
 
     def __str__(self) -> str:
         """Return what was found, in a line for people."""
@@ -212,6 +212,11 @@ def _find_sensor_camera(
     solved = rows_with(tried, "attitude_source", "stars")
     some = solved.num_rows > MAX_IDENTIFIED_TO_WARN * tried.num_rows
     tried = solved if some else tried  # the others may show the Earth
+    if camera is None:
+        LOGGER.warning(
+            "%s: its stars contradict its calibration; no other is searched for, because the log "
+            "has several", sensor.sensor_id,
+        )  # fmt: skip
     if camera is None or not tried.num_rows:
         return None
     budget_s = COST_SHARE * SearchBudget(tried.num_rows, identification.time_limit_s).total_s

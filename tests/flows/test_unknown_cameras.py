@@ -129,7 +129,7 @@ def test_optics_with_which_frames_are_lost_are_not_used(
 
     def misled(stars, cameras, told, sigma_px):
         fit = fitted(stars, cameras, told, sigma_px)
-        wrong = calibrate_sensors.with_optics(cameras, {"a": {"fx_px": 2 * told_px}})
+        wrong = calibrate_sensors.with_optics(cameras, {0: {"fx_px": 2 * told_px}})
         return fit._replace(cameras=wrong, departed=["a"])
 
     monkeypatch.setattr(calibrate_sensors, "calibrate_sensors", misled)

@@ -1,11 +1,12 @@
 """Calibrate sensors: optics that differ are found, others are unchanged."""
 
 import numpy as np
+import pyarrow as pa
 import pytest
 from scenes.cameras import cameras_of
 from scipy.spatial.transform import Rotation
 
-from epipole.schemas.bridge import array, concat, stack_covariance, table
+from epipole.schemas.bridge import array, concat, rows_of, stack_covariance, table
 from epipole.schemas.columns import OPTICS_AXES
 from epipole.schemas.tables import STARS
 from epipole.schemas.work_tables import CAMERAS
@@ -117,11 +118,54 @@ def test_few_stars_give_no_row_and_an_unchanged_camera():
     assert found.cameras.equals(told)
 
 
-def test_a_sensor_with_two_calibrations_is_unchanged():
-    both = concat(CAMERAS, [cameras("a"), cameras("a", fx_px=3700.0)])
-    found = calibrate_sensors(stars_of("a", TRUE), both, both)
-    assert found.calibrations.num_rows == 0
-    assert found.cameras.equals(both)
+OTHER = SENT._replace(fx_px=3720.0, fy_px=3720.0)
+TRUE_OTHER = OTHER._replace(fx_px=3740.0, fy_px=3740.0, k1=0.05)
+
+
+def in_periods(*optics):
+    """Return STARS of sensor a and its CAMERAS, for periods of (sent, true) optics: 40 s each."""
+    stars, sent = [], []
+    for k, (given, true) in enumerate(optics):
+        rows = stars_of("a", true, seed=k, used=given)
+        columns = {name: rows[name] for name in STARS.names}
+        later = {
+            "time": array(rows, "time") + 40 * k * 10**9,
+            "frame_number": array(rows, "frame_number") + 40 * k,
+        }
+        stars.append(table(STARS, columns | later))
+        row = rows_of(cameras_of({"a": given}))[0] | {"time": 40 * k * 10**9}
+        sent.append(pa.Table.from_pylist([row], schema=CAMERAS))
+    return concat(STARS, stars), concat(CAMERAS, sent)
+
+
+def test_each_calibration_is_fitted_to_the_stars_of_its_frames():
+    stars, sent = in_periods((SENT, TRUE), (OTHER, TRUE_OTHER))
+    found = calibrate_sensors(stars, sent, sent)
+    assert found.departed == ["a"]
+    off = array(found.cameras, "fx_px") - [TRUE.fx_px, TRUE_OTHER.fx_px]
+    assert np.all(np.abs(off) < 4 * np.sqrt(array(found.cameras, "cov_fxfx")))
+    np.testing.assert_allclose(array(found.cameras, "k1"), [TRUE.k1, TRUE_OTHER.k1], atol=0.02)
+
+
+def test_the_row_of_a_sensor_is_of_the_calibration_with_most_stars():
+    stars, sent = in_periods((SENT, TRUE), (OTHER, TRUE_OTHER), (SENT, TRUE))
+    found = calibrate_sensors(stars, sent, sent)
+    assert found.calibrations.num_rows == 1
+    assert array(found.calibrations, "fx_px")[0] == pytest.approx(TRUE.fx_px, abs=1.0)
+    # It holds again after the other one: both of its periods are fitted together.
+    fx_px = array(found.cameras, "fx_px")
+    assert fx_px[0] == fx_px[2] != fx_px[1]
+    frames = array(stars, "frame_number")
+    of_it = np.count_nonzero((frames < 40) | (frames >= 80))
+    assert array(found.calibrations, "n_stars")[0] == of_it
+
+
+def test_only_the_calibration_that_differs_gets_new_optics():
+    stars, sent = in_periods((SENT, TRUE), (OTHER, OTHER))
+    found = calibrate_sensors(stars, sent, sent)
+    assert found.departed == ["a"]
+    assert found.cameras.slice(1).equals(sent.slice(1))
+    assert array(found.cameras, "fx_px")[0] == pytest.approx(TRUE.fx_px, abs=1.0)
 
 
 def test_a_star_that_is_predicted_beyond_the_fold_of_the_distortion_takes_no_part():
