@@ -92,18 +92,19 @@ def grow_all(space, work, seeds, clear, min_score):
     min_score : float
         Minimum log-odds of a hypothesis that is returned.
     """
-    views, taken = space.views, space.taken
-    members = work.members
+    sensor, taken, members = space.views.sensor, space.taken, work.members
     h, n_nearby, a, b = 0, 0, -1, -1
-    seed, value_of, clears = np.empty(4, np.int64), np.empty(4), np.empty(4, np.bool_)
-    x_km, member, missed = np.empty((4, 3)), np.empty(64, np.int64), np.empty(64, np.int64)
-    first_member, first_missed = np.zeros(5, np.int64), np.zeros(5, np.int64)
+    grown = Grown(
+        np.empty(4, np.int64), np.empty(4), np.empty(4, np.bool_), np.empty((4, 3)),
+        np.zeros(5, np.int64), np.empty(64, np.int64),
+        np.zeros(5, np.int64), np.empty(64, np.int64),
+    )  # fmt: skip
     for q in range(len(seeds)):
         if taken[seeds[q, 0]] or taken[seeds[q, 1]]:
             continue
         members[0], members[1] = seeds[q, 0], seeds[q, 1]
-        if views.sensor[members[0]] != a or views.sensor[members[1]] != b:
-            a, b = views.sensor[members[0]], views.sensor[members[1]]
+        if sensor[members[0]] != a or sensor[members[1]] != b:
+            a, b = sensor[members[0]], sensor[members[1]]
             n_nearby = sensors_sharing(
                 space.fields, a, b, work.stamp, next_mark(work.stamp), work.nearby
             )
@@ -114,29 +115,53 @@ def grow_all(space, work, seeds, clear, min_score):
         value, _, n_missed = score(space, work, members[:n], work.near[:n_near])
         if not value > min_score:
             continue
-        if h == len(seed):
-            seed, value_of, clears = doubled(seed, h), doubled(value_of, h), doubled(clears, h)
-            x_km = doubled(x_km, h)
-            first_member = doubled(first_member, h + 1)
-            first_missed = doubled(first_missed, h + 1)
-        at, at_missed = first_member[h], first_missed[h]
-        member, missed = _with_capacity(member, at, n), _with_capacity(missed, at_missed, n_missed)
-        member[at : at + n] = members[:n]
-        member[at : at + n].sort()
-        missed[at_missed : at_missed + n_missed] = work.missed[:n_missed]
-        x_km[h] = work.points.x_km[np.argmax(work.points.seen_by >= 2)]
         is_clear = _is_clear(space, work, members[:n], n_missed, value, clear)
-        seed[h], value_of[h], clears[h] = q, value, is_clear
+        grown = _with_space(grown, h, n, n_missed)
+        grown.seed[h], grown.score[h], grown.taken[h] = q, value, is_clear
+        _enter(grown, h, work, n, n_missed)
         h += 1
-        first_member[h], first_missed[h] = at + n, at_missed + n_missed
         if is_clear:
             for i in members[:n]:
                 taken[i] = True
     return Grown(
-        seed[:h], value_of[:h], clears[:h], x_km[:h],
-        first_member[: h + 1], member[: first_member[h]],
-        first_missed[: h + 1], missed[: first_missed[h]],
+        grown.seed[:h], grown.score[:h], grown.taken[:h], grown.x_km[:h],
+        grown.first_member[: h + 1], grown.member[: grown.first_member[h]],
+        grown.first_missed[: h + 1], grown.missed[: grown.first_missed[h]],
     )  # fmt: skip
+
+
+@kernel
+def _with_space(grown, h, n, n_missed):
+    """Return `grown` with space for hypothesis h, of n members and `n_missed` sensors.
+
+    Where its arrays are full, those returned are longer ones with the same first values.
+    """
+    seed, value, taken, x_km, first_member, member, first_missed, missed = grown
+    if h == len(seed):
+        seed, value, taken, x_km = (
+            doubled(seed, h), doubled(value, h), doubled(taken, h), doubled(x_km, h),
+        )  # fmt: skip
+        first_member, first_missed = doubled(first_member, h + 1), doubled(first_missed, h + 1)
+    while first_member[h] + n > len(member):
+        member = doubled(member, first_member[h])
+    while first_missed[h] + n_missed > len(missed):
+        missed = doubled(missed, first_missed[h])
+    return Grown(seed, value, taken, x_km, first_member, member, first_missed, missed)
+
+
+@kernel
+def _enter(grown, h, work, n, n_missed):
+    """Enter the hypothesis of `work` as number h: its point, its members, the sensors it misses.
+
+    They are the first n of `work.members` and the first `n_missed` of `work.missed`.
+    """
+    at, at_missed = grown.first_member[h], grown.first_missed[h]
+    grown.first_member[h + 1], grown.first_missed[h + 1] = at + n, at_missed + n_missed
+    grown.x_km[h] = work.points.x_km[np.argmax(work.points.seen_by >= 2)]
+    of_it = grown.member[at : at + n]
+    of_it[:] = work.members[:n]
+    of_it.sort()
+    grown.missed[at_missed : at_missed + n_missed] = work.missed[:n_missed]
 
 
 @borrowing_kernel
@@ -414,11 +439,3 @@ def _is_clear(space, work, members, n_missed, value, clear):
     for s in work.missed[:n_missed]:
         expected += detected[s]
     return n_detecting >= MIN_COMPLETENESS * expected
-
-
-@kernel
-def _with_capacity(values, n, more):
-    """Return `values` (m,), or a longer array with the same first n of them, for `more` values."""
-    while n + more > len(values):
-        values = doubled(values, n)
-    return values

@@ -5,8 +5,11 @@ all groups are known, each tracklet is weighed again. It goes to the object that
 best. If two explain it about equally well, it goes to neither.
 """
 
+from typing import NamedTuple
+
 import numpy as np
 
+from epipole.schemas.arrays import Array, Indices
 from epipole.tasks.algorithms.association.search.candidates import (
     best_of_sensor,
     odds_of_view,
@@ -15,9 +18,27 @@ from epipole.tasks.algorithms.association.search.candidates import (
 from epipole.tasks.algorithms.association.search.field_index import near_points
 from epipole.tasks.algorithms.association.search.growth import MIN_GAIN, MIN_LEAD
 from epipole.tasks.algorithms.association.search.instant_points import solve
+from epipole.tasks.algorithms.association.search.search_space import doubled
 from epipole.tasks.algorithms.kernels import borrowing_kernel, kernel
 
 MIN_TRACKLETS = 3  # of an object, before it gains one and after it loses one
+
+
+class _Groups(NamedTuple):
+    """The points of n groups at k instants.
+
+    x_km, cov_km2 : (n, k, 3), (n, k, 3, 3) float
+        Points and their covariances, GCRF.
+    seen_by : (n, k) int
+        Views of each point; solved are those of two views or more.
+    size : (n,) int
+        Tracklets of each group; 0 where it does not take part.
+    """
+
+    x_km: Array
+    cov_km2: Array
+    seen_by: Indices
+    size: Indices
 
 
 @kernel
@@ -27,77 +48,88 @@ def resolve_conflicts(space, work, group, x_km):
     Only objects of three tracklets or more take part, and none falls below three. `space.taken`
     must be all false. `x_km` (g, 3) are the objects' points at their first instant.
     """
+    n_sensors = space.views.camera.shape[0]
+    groups, near_sensor, near_group = _solve_groups(space, work, group, x_km)
+    meetings, first = _sorted_by(near_sensor, n_sensors)
+    for s in range(n_sensors):  # by sensor: its tracklets fit into a processor's cache
+        for q in meetings[first[s] : first[s + 1]]:
+            _weigh_again(space, work, group, groups, s, near_group[q])
+
+
+@kernel
+def _solve_groups(space, work, group, x_km):
+    """Return `_Groups`, and the sensors whose field may hold their points: (m,) sensor and group.
+
+    Arguments as in `resolve_conflicts`. Groups with fewer than `MIN_TRACKLETS`, and those whose
+    tracklets have no common points, do not take part.
+    """
     views, n_groups = space.views, len(x_km)
-    k, n_sensors = len(views.time_s), views.camera.shape[0]
-    X, P = np.zeros((n_groups, k, 3)), np.zeros((n_groups, k, 3, 3))
-    seen_by = np.zeros((n_groups, k), np.int64)
-    size = np.zeros(n_groups, np.int64)
-    members, first = _by_group(group, n_groups)
-    near, first_near = np.empty((4 * len(group), 2), np.int64), np.zeros(n_sensors + 1, np.int64)
-    n_near = 0
+    k = len(views.time_s)
+    groups = _Groups(
+        np.zeros((n_groups, k, 3)), np.zeros((n_groups, k, 3, 3)),
+        np.zeros((n_groups, k), np.int64), np.zeros(n_groups, np.int64),
+    )  # fmt: skip
+    members, first = _sorted_by(group, n_groups)
+    sensor, of_group, n = np.empty(64, np.int64), np.empty(64, np.int64), 0
     for g in range(n_groups):
-        of_group = members[first[g] : first[g + 1]]
-        if len(of_group) < MIN_TRACKLETS:
+        of_g = members[first[g] : first[g + 1]]
+        if len(of_g) < MIN_TRACKLETS:
             continue
         work.points.seen_by[:] = 0
         if k == 1:  # a good initial point
             work.points.x_km[0], work.points.seen_by[0] = x_km[g], 2
-        chi2, _ = solve(views, of_group, work.points, work.part)
+        chi2, _ = solve(views, of_g, work.points, work.part)
         if np.isnan(chi2):
             continue
-        X[g], P[g], seen_by[g] = work.points.x_km, work.points.cov_km2, work.points.seen_by
-        size[g] = len(of_group)
-        n = near_points(space, work, *_two_sensors(views, of_group))
-        while n_near + n > len(near):
-            longer = np.empty((2 * len(near), 2), np.int64)
-            longer[:n_near] = near[:n_near]
-            near = longer
-        for s in work.near[:n]:
-            near[n_near, 0], near[n_near, 1] = s, g
-            first_near[s + 1] += 1
-            n_near += 1
-    groups_near = np.empty(n_near, np.int64)
-    first_near = np.cumsum(first_near)
-    filled = first_near.copy()
-    for q in range(n_near):
-        s = near[q, 0]
-        groups_near[filled[s]] = near[q, 1]
-        filled[s] += 1
-    for s in range(n_sensors):  # by sensor: its tracklets fit into a processor's cache
-        for g in groups_near[first_near[s] : first_near[s + 1]]:
-            if size[g] < MIN_TRACKLETS:
-                continue
-            _enter_points(work.points, g, X, P, seen_by)
-            if not other_group_near(space, work, s, group, g):
-                continue
-            c, gain, _ = best_of_sensor(space, work, s, members[:0], MIN_GAIN)
-            if c < 0 or group[c] < 0 or group[c] == g:
-                continue
-            o = group[c]
-            if size[o] <= MIN_TRACKLETS:
-                continue
-            _enter_points(work.points, o, X, P, seen_by)
-            present_gain = odds_of_view(space, work, s, c)
-            if present_gain - gain < MIN_LEAD:
-                size[o] -= 1
-                group[c] = -1
-                if gain - present_gain >= MIN_LEAD and not _has(views, group, s, g):
-                    group[c] = g
-                    size[g] += 1
+        groups.x_km[g], groups.cov_km2[g] = work.points.x_km, work.points.cov_km2
+        groups.seen_by[g], groups.size[g] = work.points.seen_by, len(of_g)
+        for s in work.near[: near_points(space, work, *_two_sensors(views, of_g))]:
+            if n == len(sensor):
+                sensor, of_group = doubled(sensor, n), doubled(of_group, n)
+            sensor[n], of_group[n] = s, g
+            n += 1
+    return groups, sensor[:n], of_group[:n]
 
 
 @borrowing_kernel
-def _enter_points(points, g, X, P, seen_by):
-    """Enter the points of group g in `points`, `InstantPoints`.
+def _weigh_again(space, work, group, groups, s, g):
+    """Weigh a tracklet of sensor s that group g explains best, but another group has.
 
-    Of n groups: `X` (n, k, 3) [km] and `P` (n, k, 3, 3) [km^2], GCRF, and `seen_by` (n, k).
+    It changes to g if g explains it better by `MIN_LEAD`, and has no other of the sensor; it stays
+    if it is better where it is by as much; else it is in no group. Changes `group` (t,) and
+    `groups.size`.
     """
+    if groups.size[g] < MIN_TRACKLETS:
+        return
+    _enter_points(work.points, groups, g)
+    if not other_group_near(space, work, s, group, g):
+        return
+    c, gain, _ = best_of_sensor(space, work, s, work.same_sensor[:0], MIN_GAIN)
+    if c < 0 or group[c] < 0 or group[c] == g:
+        return
+    present = group[c]
+    if groups.size[present] <= MIN_TRACKLETS:
+        return
+    _enter_points(work.points, groups, present)
+    lead = gain - odds_of_view(space, work, s, c)
+    if not lead > -MIN_LEAD:
+        return
+    groups.size[present] -= 1
+    group[c] = -1
+    if lead >= MIN_LEAD and not _has(space.views, group, s, g):
+        group[c] = g
+        groups.size[g] += 1
+
+
+@borrowing_kernel
+def _enter_points(points, groups, g):
+    """Enter the points of group g in `points`, `InstantPoints`."""
     for m in range(len(points.seen_by)):
-        points.seen_by[m] = seen_by[g, m]
+        points.seen_by[m] = groups.seen_by[g, m]
         for a in range(3):
-            points.x_km[m, a] = X[g, m, a]
+            points.x_km[m, a] = groups.x_km[g, m, a]
             for b in range(3):
-                points.cov_km2[m, a, b] = P[g, m, a, b]
+                points.cov_km2[m, a, b] = groups.cov_km2[g, m, a, b]
 
 
 @borrowing_kernel
@@ -119,21 +151,21 @@ def _has(views, group, s, g):
 
 
 @kernel
-def _by_group(group, n_groups):
-    """Return the tracklets sorted by group, and where each group begins.
+def _sorted_by(number, n):
+    """Return the rows in order of their number, and where those of each number begin.
 
-    `group` (t,) is -1 for no group. Tracklets of group g are ``members[first[g]:first[g + 1]]`` of
-    the arrays returned, members (n,) and first (n_groups + 1,).
+    `number` (t,) is from 0 to n - 1, or -1 for rows that are left out. Rows of number k are
+    ``rows[first[k]:first[k + 1]]`` of the arrays returned, rows (m,) and first (n + 1,).
     """
-    first = np.zeros(n_groups + 1, np.int64)
-    for g in group:
-        if g >= 0:
-            first[g + 1] += 1
-    for g in range(n_groups):
-        first[g + 1] += first[g]
-    members, filled = np.zeros(first[n_groups], np.int64), first.copy()
-    for i in range(len(group)):
-        if group[i] >= 0:
-            members[filled[group[i]]] = i
-            filled[group[i]] += 1
-    return members, first
+    first = np.zeros(n + 1, np.int64)
+    for k in number:
+        if k >= 0:
+            first[k + 1] += 1
+    for k in range(n):
+        first[k + 1] += first[k]
+    rows, filled = np.zeros(first[n], np.int64), first.copy()
+    for i in range(len(number)):
+        if number[i] >= 0:
+            rows[filled[number[i]]] = i
+            filled[number[i]] += 1
+    return rows, first
