@@ -114,7 +114,11 @@ class _Pairs(NamedTuple):
     def of(self, concerned: Flags) -> "_Pairs":
         """Return the pairs with a view that is concerned (n,)."""
         wanted = concerned[self.a] | concerned[self.b]
-        return self._replace(a=self.a[wanted], b=self.b[wanted], number=self.number[wanted])
+        numbers, number = np.unique(self.number[wanted], return_inverse=True)
+        return self._replace(
+            a=self.a[wanted], b=self.b[wanted], number=number.reshape(-1),
+            tracklets=self.tracklets[numbers],
+        )  # fmt: skip
 
 
 class _Nearest(NamedTuple):
