@@ -74,7 +74,7 @@ def name_uniquely() -> None:
     numba numbers functions from 1 in each process. The number is all that distinguishes inner
     functions of one name and type, such as those of `np.sort` and `np.argsort`. But kernels that
     several processes have compiled are loaded into one, and of two functions of one name the linker
-    takes the first for both: a kernel's `np.argsort` returned sorted values.
+    takes the first for both: a kernel's `np.argsort` returned sorted values (numba issue 10486).
     """
     _number_from_anywhere()
     os.register_at_fork(after_in_child=_number_from_anywhere)

@@ -129,6 +129,16 @@ def _ends_run(data, kind, after):
 
 
 @kernel
+def _least_bytes(kind):
+    """Return the minimum length [bytes] of a message, schema or channel; 0 for other opcodes."""
+    if kind == MESSAGE:
+        return MESSAGE_BYTES
+    if kind == SCHEMA:
+        return SCHEMA_BYTES
+    return CHANNEL_BYTES if kind == CHANNEL else 0
+
+
+@kernel
 def _walk(data, at, outside, ends, most, opcode, channel, time_ns, start, end):
     """Return how many records there are, and write those that the columns have room for.
 
@@ -159,15 +169,9 @@ def _walk(data, at, outside, ends, most, opcode, channel, time_ns, start, end):
         if length > np.uint64(size - body):
             break
         after = body + np.int64(length)
-        least = 0
-        if kind == MESSAGE:
-            least = MESSAGE_BYTES
-        elif kind == SCHEMA:
-            least = SCHEMA_BYTES
-        elif kind == CHANNEL:
-            least = CHANNEL_BYTES
         if ends and _ends_run(data, kind, after):
             break
+        least = _least_bytes(kind)
         if least and after - body >= least:
             if n == most:
                 break
