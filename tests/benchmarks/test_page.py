@@ -19,6 +19,7 @@ from page import (
     as_markdown,
     part_of,
     run,
+    shown,
     write_page,
 )
 
@@ -54,6 +55,15 @@ def test_tables_stay_tables_and_other_lines_are_fenced():
     ]
 
 
+def test_of_a_long_output_only_some_lines_and_columns_are_shown():
+    said = "Camera a\n| x | y | z |\n|---|---|---|\n| 1 | 2 | 3 |\n| 4 | 5 | 6 |\n\nin 3 s\n"
+    assert shown(said, Benchmark("clocks")).split() == said.split()
+    one = Benchmark("clocks", lines="Camera|5", columns=("z", "x"))
+    assert shown(said, one) == "Camera a\n| z | x |\n|---|---|\n| 6 | 4 |"
+    with pytest.raises(ValueError, match="other"):
+        shown(said, Benchmark("clocks", columns=("other",)))
+
+
 def test_a_part_names_its_commit_only_if_the_page_has_no_common_one():
     one = Benchmark("clocks", "--offsets 0.1")
     assert part_of(one, result(), alone=False).startswith(
@@ -76,7 +86,8 @@ def copy(tmp_path, monkeypatch):
 
 
 def test_a_whole_round_has_one_date_commit_and_machine(copy):
-    write_page({name: result() for name in PLAN})
+    heads = {name: f"| {' | '.join(each.columns or 'a')} |\n" for name, each in PLAN.items()}
+    write_page({name: result(head) for name, head in heads.items()})
     minutes = round(12.3 * len(PLAN) / 60)
     assert f"All tables: 2031-04-01, commit abc; 2 cores; {minutes} minutes." in copy.read_text()
     assert copy.read_text().count("commit abc") == 1
