@@ -93,8 +93,8 @@ def crossings(
                         found.append((t + rng.uniform(0, STEP_S), sensor, number))
                     last[sensor, number] = t
     found.sort()
-    rows = np.array(found).reshape(-1, 3)
-    return rows[:, 0], rows[:, 1].astype(np.int64), rows[:, 2].astype(np.int64)
+    time_s, sensor, number = np.array(found).reshape(-1, 3).T
+    return time_s.copy(), sensor.astype(np.int64), number.astype(np.int64)
 
 
 def measured(
