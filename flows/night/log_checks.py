@@ -13,7 +13,7 @@ from epipole.flows.night.progress import results
 from epipole.flows.night.work import Work
 from epipole.io.datasets.rows_by_night import rows_of_night
 from epipole.io.work.parts import read_part
-from epipole.schemas.bridge import array, concat
+from epipole.schemas.bridge import array, concat, rows_with
 from epipole.schemas.log_checks import CheckVerdict, LogCheck, mistakes
 from epipole.schemas.settings import Settings
 from epipole.schemas.spans import DAY_NS, SPAN_NS, day_of
@@ -114,7 +114,11 @@ def check_readings(settled: Settled, frames: OrderedFrames, checks: pa.Table) ->
 
 def _exposure_s(frames: OrderedFrames, sensor: int) -> float:
     """Return the median exposure time of a sensor's frames, 0 where it is unknown."""
-    pieces = [read_part(piece, "exposures", ["exposure_s"]) for piece in frames.pieces[sensor]]
+    columns, name = ["sensor_id", "exposure_s"], frames.sensors[sensor]
+    pieces = [
+        rows_with(read_part(piece, "exposures", columns), "sensor_id", name)
+        for piece in frames.pieces[sensor]
+    ]
     return float(np.median(array(pa.concat_tables(pieces), "exposure_s")))
 
 
