@@ -1,7 +1,7 @@
 """Messages as ROS 2 writes them: CDR, each number aligned to its size."""
 
 import struct
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -167,7 +167,7 @@ def _put_camera_info(out: CdrWriter, values: Values) -> None:
     out.put_string(values["distortion_model"])
     for name in "DKRP":
         out.put_numbers(values[name], "f8", counted=name == "D")
-    for _ in range(6):  # binning in x and y, and the region of interest: not used
+    for _ in range(6):  # binning in x and y, and the region of interest: all pixels
         out.put("I", 0)
     out.put("B", 0)
 
@@ -250,7 +250,38 @@ def _camera_info(reader: CdrReader) -> CalibrationMessage:
     height, width = reader.number("I"), reader.number("I")
     model = reader.text()
     distortion, matrix = reader.numbers("f8"), reader.numbers("f8", 9)
-    return CalibrationMessage(time_ns, sensor_id, width, height, model, distortion, matrix)
+    for count in (9, 12):  # R and P: not used
+        reader.numbers("f8", count)
+    bins, window = ([reader.number("I") for _ in range(n)] for n in (2, 4))
+    whole = CalibrationMessage(time_ns, sensor_id, width, height, model, distortion, matrix)
+    return _of_images(whole, bins, window) if max(bins) > 1 or any(window) else whole
+
+
+def _of_images(
+    whole: CalibrationMessage, bins: Sequence[int], window: Sequence[int]
+) -> CalibrationMessage:
+    """Return the calibration of the pixels that images have, from that of all pixels of a sensor.
+
+    As ROS defines binning and the region of interest in REP 104.
+
+    Parameters
+    ----------
+    whole
+        The calibration as a CameraInfo states it.
+    bins
+        Pixels in a pixel of the image, along columns and rows; 0 is 1.
+    window
+        Left, top, height and width of the part that images show [px]; without a size it is all.
+    """
+    (bins_x, bins_y), (left, top, height, width) = (max(n, 1) for n in bins), window
+    K = whole.K.astype(float)
+    K[[0, 1]] /= bins_x
+    K[[3, 4]] /= bins_y
+    # The middle of a pixel is that of the pixels in it.
+    K[2] = (K[2] - left + 0.5) / bins_x - 0.5
+    K[5] = (K[5] - top + 0.5) / bins_y - 0.5
+    sides = (width or whole.width) // bins_x, (height or whole.height) // bins_y
+    return whole._replace(width=sides[0], height=sides[1], K=K)
 
 
 # Where fields lie

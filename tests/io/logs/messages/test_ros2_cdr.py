@@ -5,7 +5,8 @@ import struct
 import pytest
 
 from epipole.io.logs.messages.ros2_cdr import ENCODING, message_definition, ros2_schema
-from epipole.schemas.log_messages import DECLARED, FRAME, STATE
+from epipole.io.logs.writer import calibration_values
+from epipole.schemas.log_messages import CALIBRATION, DECLARED, FRAME, STATE
 
 # The .msg files of epipole_msgs, which recorders compile.
 DEFINITIONS = {
@@ -55,3 +56,34 @@ def test_big_endian_cdr_is_read():
     assert (frame.frame_number, frame.exposure_s) == ((1 << 40) + 1, 0.25)
     for name, numbers in arrays.items():
         assert getattr(frame, name).tolist() == numbers
+
+
+def camera_info(bins=(0, 0), window=(0, 0, 0, 0)):
+    """Return the CameraInfo of a sensor of 1024 x 768 pixels, with binning and a window."""
+    camera = {
+        "width": 1024, "height": 768, "fx_px": 2000.0, "fy_px": 1900.0, "cx_px": 511.5,
+        "cy_px": 383.5, "k1": 0.1, "k2": 0.0, "p1": 0.0, "p2": 0.0, "k3": 0.0,
+    }  # fmt: skip
+    data = ENCODING.encode(
+        CALIBRATION, calibration_values("sat1", 1_600_000_000_000_000_000, camera)
+    )
+    return data[:-25] + struct.pack("<6I", *bins, *window) + b"\0"
+
+
+@pytest.mark.parametrize(
+    ("bins", "window", "sides", "focal", "middle"),
+    [
+        ((0, 0), (0, 0, 0, 0), (1024, 768), (2000.0, 1900.0), (511.5, 383.5)),
+        ((1, 1), (0, 0, 768, 1024), (1024, 768), (2000.0, 1900.0), (511.5, 383.5)),
+        ((2, 4), (0, 0, 0, 0), (512, 192), (1000.0, 475.0), (255.5, 95.5)),
+        ((0, 0), (256, 128, 512, 512), (512, 512), (2000.0, 1900.0), (255.5, 255.5)),
+        ((2, 2), (256, 128, 512, 512), (256, 256), (1000.0, 950.0), (127.5, 127.5)),
+    ],
+)  # fmt: skip
+def test_a_camera_info_is_read_for_the_pixels_of_its_images(bins, window, sides, focal, middle):
+    # ROS states the optics of all pixels; images may be binned, or show a part of them.
+    found = ENCODING.decoded(CALIBRATION, camera_info(bins, window))
+    assert (found.width, found.height) == sides
+    assert (found.K[0], found.K[4]) == focal
+    assert (found.K[2], found.K[5]) == middle
+    assert found.D[0] == 0.1
