@@ -12,11 +12,13 @@ from typing import Any, TypedDict, Unpack
 import numpy as np
 import pyarrow as pa
 
-from epipole.io.logs.writer import LogWriter
+from epipole.io.logs.messages.registry import encoding_named
+from epipole.io.logs.writer import LogWriter, calibration_values
 from epipole.io.paths import fault_of_name
 from epipole.io.simulation.scenes import read_scene
 from epipole.io.simulation.truth import SUFFIX, TruthWriter
 from epipole.schemas.errors import SceneError
+from epipole.schemas.log_messages import CALIBRATION
 from epipole.schemas.scene import Scene, validate_scene
 from epipole.schemas.star_lists import ElementSet
 from epipole.tasks.algorithms.simulation.constants import ARCSEC, SECOND_NS
@@ -106,7 +108,8 @@ def simulate(
     Raises
     ------
     SceneError
-        Where the scene or an option is invalid, or the log cannot be written.
+        Where the scene or an option is invalid, the encoding cannot hold its calibrations or
+        times, or the log cannot be written.
     """
     settled = scene if isinstance(scene, Scene) else read_scene(scene)
     settled = _with_options(settled, options)
@@ -120,6 +123,7 @@ def simulate(
     is_folder = out.suffix != ".mcap" and any(g.orbit.shells for g in settled.sensors)
     if is_folder and logs > 1:
         raise SceneError(f"logs = {logs}: a folder has one log for each satellite")
+    _check_encoding(settled, encoding)
     simulation = simulate_scene(settled)
     form: dict[str, Any] = {"encoding": encoding, "compression": compression}
     try:
@@ -129,6 +133,18 @@ def simulate(
         return _write_in_time(simulation, out, names, form)
     except OSError as error:
         raise SceneError(f"{out}: cannot be written: {error}") from error
+
+
+def _check_encoding(scene: Scene, encoding: str) -> None:
+    """Raise where messages of an encoding cannot hold the calibrations or the end of a scene."""
+    form = encoding_named(encoding)
+    end_ns = round((scene.start.timestamp() + scene.duration_s) * SECOND_NS)
+    for sensor in scene.sensors:
+        camera = sent_optics(sensor.camera)._asdict()
+        try:
+            form.encode(CALIBRATION, calibration_values(sensor.id, end_ns, camera))
+        except ValueError as error:
+            raise SceneError(f"{scene.name} as {encoding}: {error}") from error
 
 
 def _write_in_time(

@@ -138,7 +138,8 @@ def write_log(
         Where a column is missing, unknown, of the wrong type, or null where it may not be; where a
         velocity or an attitude has a part of its components; where
         the lists of a frame differ in length; where a sensor's id is invalid; where a pinhole has
-        `k4`, or a fisheye `p1` or `p2`; where the encoding is unknown.
+        `k4`, or a fisheye `p1` or `p2`; where the encoding is unknown, or ros2 where
+        the tables have a time after 2038 or a `line_time_s`, which its messages cannot hold.
 
     Warns
     -----

@@ -1,5 +1,6 @@
 """Simulated logs and their truth: the same again from the same seed, with what the scene says."""
 
+import datetime
 from pathlib import Path
 
 import numpy as np
@@ -61,6 +62,18 @@ def test_an_option_or_a_place_that_does_not_fit_is_refused(tmp_path):
     (tmp_path / "file").touch()
     with pytest.raises(SceneError, match=r"file/n.mcap: cannot be written"):
         simulate("lost_in_space", tmp_path / "file" / "n.mcap")
+
+
+def test_a_scene_that_an_encoding_cannot_hold_is_refused_before_any_work(tmp_path):
+    late = datetime.datetime(2038, 1, 19, 3, 14, tzinfo=datetime.UTC)
+    with pytest.raises(SceneError, match=r"lost_in_space as ros2: .*no times after 2038-01-19"):
+        simulate("lost_in_space", tmp_path / "n.mcap", encoding="ros2", start=late, seconds=9.0)
+    text = (BUILT_IN / "lost_in_space.toml").read_text()
+    rolling = tmp_path / "rolling.toml"
+    rolling.write_text(text.replace("fov_deg = 20.3", "fov_deg = 20.3, line_time_s = 1e-5"))
+    with pytest.raises(SceneError, match=r"as ros2: a CameraInfo has no line time"):
+        simulate(rolling, tmp_path / "n.mcap", encoding="ros2", seconds=1.0)
+    assert [path.name for path in tmp_path.iterdir()] == ["rolling.toml"]
 
 
 def test_a_scene_is_not_overwritten_by_its_log(tmp_path):

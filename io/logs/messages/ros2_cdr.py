@@ -100,6 +100,7 @@ def ros2_schema(kind: str) -> bytes:
 
 _NUMBERS = {"double": "f8", "float": "f4"}
 _LITTLE_ENDIAN = b"\x00\x01\x00\x00"
+_LAST_SECOND = 2**31 - 1  # of an int32, since 1970
 
 
 class CdrWriter:
@@ -116,6 +117,8 @@ class CdrWriter:
     def put_time(self, time_ns: int) -> None:
         """Add a builtin_interfaces/Time."""
         seconds, nanos = divmod(time_ns, SECOND_NS)
+        if seconds > _LAST_SECOND:
+            raise ValueError("ROS 2 has no times after 2038-01-19: take another encoding")
         self.put("i", seconds)
         self.put("I", nanos)
 
