@@ -32,6 +32,8 @@ _THEORIES = ("SGP4", "SGP", "SGP/SGP4")
 _XP = "4"  # the ephemeris type of SGP4-XP
 _OF_XP = "its ephemeris type is 4 (SGP4-XP), expected SGP4"
 _MEAN = ("bstar", "ndot", "nddot", "ecco", "argpo", "inclo", "mo", "no_kozai", "nodeo")
+# What messages of elements for SGP4 have (CCSDS 502.0-B-3); else they mean another orbit or time.
+_OF_SGP4 = {"CENTER_NAME": "EARTH", "REF_FRAME": "TEME", "TIME_SYSTEM": "UTC"}
 
 
 class Fault(NamedTuple):
@@ -206,6 +208,9 @@ def _with_defaults(fields: dict[str, str]) -> dict[str, str]:
         raise ValueError(_OF_XP)
     # sgp4 refuses the numbers above 339999, which two-line elements cannot hold.
     changed = {"EPOCH": _epoch(fields["EPOCH"]), "NORAD_CAT_ID": "0"}
+    for name, expected in _OF_SGP4.items():
+        if (given := fields.get(name) or expected).upper() != expected:
+            raise ValueError(f"{name} is {given}, expected {expected}")
     return fields | unused | changed
 
 

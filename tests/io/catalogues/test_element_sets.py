@@ -103,6 +103,27 @@ def test_elements_for_sgp4_are_read(theory, tmp_path):
     assert len(read_known_objects(write(tmp_path / "a.json", text)).sets) == 1
 
 
+@pytest.mark.parametrize(
+    ("changed", "what"),
+    [
+        ({"TIME_SYSTEM": "TAI"}, "TIME_SYSTEM is TAI, expected UTC"),
+        ({"CENTER_NAME": "MARS"}, "CENTER_NAME is MARS, expected EARTH"),
+        ({"REF_FRAME": "EME2000"}, "REF_FRAME is EME2000, expected TEME"),
+    ],
+)
+def test_elements_at_other_times_or_in_other_frames_are_told(changed, what, tmp_path):
+    known = read_known_objects(write(tmp_path / "a.json", json.dumps([omm(), omm(**changed)])))
+    assert [str(fault) for fault in known.faults] == [f"message 2: not an OMM: {what}"]
+    assert len(known.sets) == 1
+
+
+@pytest.mark.parametrize(
+    "given", [{"TIME_SYSTEM": "utc"}, {"CENTER_NAME": "Earth"}, {"REF_FRAME": ""}]
+)
+def test_what_elements_for_sgp4_have_may_be_in_any_case_or_missing(given, tmp_path):
+    assert len(read_known_objects(write(tmp_path / "a.json", json.dumps([omm(**given)]))).sets) == 1
+
+
 def segment(left_out=None):
     """Return a segment of an OMM in XML, without one of its parts."""
     fields = omm()
