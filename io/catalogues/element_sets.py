@@ -24,16 +24,18 @@ _UNIX_EPOCH_JD = 2440587.5
 _SGP4_EPOCH_JD = 2433281.5  # 1949 December 31, 0h
 _DAY_NS = 86_400_000_000_000
 _LINE_LENGTH = 69
+_LARGEST_NUMBER = 999_999_999  # of a satellite: messages have nine digits
+_LAST_NS = 2**63 - 1  # a time of tables
 _TYPE = 62  # the column of line 1 with the ephemeris type
 # A line of elements however much of it was cut off, and not a name: it has the satellite's number.
 _CUT = re.compile(r"1 [ 0-9A-Z][ 0-9]{4}([A-Z ]|$)|2 [ 0-9A-Z][ 0-9]{4}( |$)")
 # Elements for other theories, such as SGP4-XP, mean another orbit.
 _THEORIES = ("SGP4", "SGP", "SGP/SGP4")
 _XP = "4"  # the ephemeris type of SGP4-XP
-_OF_XP = "its ephemeris type is 4 (SGP4-XP), expected SGP4"
-_MEAN = ("bstar", "ndot", "nddot", "ecco", "argpo", "inclo", "mo", "no_kozai", "nodeo")
 # What messages of elements for SGP4 have (CCSDS 502.0-B-3); else they mean another orbit or time.
 _OF_SGP4 = {"CENTER_NAME": "EARTH", "REF_FRAME": "TEME", "TIME_SYSTEM": "UTC"}
+_OF_XP = "its ephemeris type is 4 (SGP4-XP), expected SGP4"
+_MEAN = ("bstar", "ndot", "nddot", "ecco", "argpo", "inclo", "mo", "no_kozai", "nodeo")
 
 
 class Fault(NamedTuple):
@@ -206,11 +208,11 @@ def _with_defaults(fields: dict[str, str]) -> dict[str, str]:
         raise ValueError(f"MEAN_ELEMENT_THEORY is {fields['MEAN_ELEMENT_THEORY']}, expected SGP4")
     if fields.get("EPHEMERIS_TYPE") == _XP:
         raise ValueError(_OF_XP)
-    # sgp4 refuses the numbers above 339999, which two-line elements cannot hold.
-    changed = {"EPOCH": _epoch(fields["EPOCH"]), "NORAD_CAT_ID": "0"}
     for name, expected in _OF_SGP4.items():
         if (given := fields.get(name) or expected).upper() != expected:
             raise ValueError(f"{name} is {given}, expected {expected}")
+    # sgp4 refuses the numbers above 339999, which two-line elements cannot hold.
+    changed = {"EPOCH": _epoch(fields["EPOCH"]), "NORAD_CAT_ID": "0"}
     return fields | unused | changed
 
 
@@ -228,6 +230,10 @@ def _element_set(title: str, number: int, cospar_id: str, satellite: Any) -> Ele
     if not (is_orbit and all(map(math.isfinite, elements))):
         raise ValueError("mean motion, eccentricity, epoch or an angle is out of bounds")
     epoch_ns = round((day - _UNIX_EPOCH_JD) * _DAY_NS) + round(part * _DAY_NS)
+    if abs(epoch_ns) > _LAST_NS:
+        raise ValueError("its epoch is out of bounds")
+    if not 0 <= number <= _LARGEST_NUMBER:
+        raise ValueError(f"the number of the satellite is {number}, expected nine digits at most")
     return ElementSet(title, number, epoch_ns, elements, cospar_id)
 
 

@@ -190,6 +190,17 @@ def test_numbers_may_have_more_than_five_digits(tmp_path):
     assert [each.number for each in known.sets] == [123456, 987654321]
 
 
+def test_what_no_table_can_hold_is_an_invalid_record(tmp_path):
+    # Times of tables end in 2262, and numbers of satellites have nine digits.
+    odd = [omm(EPOCH="9999-12-31T00:00:00"), omm(EPOCH="0001-01-01T00:00:00")]
+    odd += [omm(NORAD_CAT_ID=10**9), omm(NORAD_CAT_ID="-5"), omm(NORAD_CAT_ID="9" * 40)]
+    known = read_known_objects(write(tmp_path / "a.json", json.dumps([*odd, omm()])))
+    assert [each.number for each in known.sets] == [25544]
+    assert [fault.where for fault in known.faults] == [f"message {k}" for k in range(1, 6)]
+    assert "epoch is out of bounds" in str(known.faults[0])
+    assert "nine digits at most" in str(known.faults[2])
+
+
 def test_a_table_may_have_comments_and_spaces_after_commas(tmp_path):
     fields = omm()
     rows = ["# from a web page", "", ", ".join(fields), ", ".join(map(str, fields.values()))]
