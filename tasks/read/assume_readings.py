@@ -86,12 +86,19 @@ def as_assumed_source(
 
 def _ahead_ns(time_ns: Nanoseconds, assumed: Assumption) -> Nanoseconds:
     """Return by how much written times are ahead of UTC."""
-    ahead_s = np.full(len(time_ns), assumed.ahead_s)
-    if assumed.time != "utc":
-        ahead_s += tai_minus_utc_s(utc_julian_date(time_ns)[0])
-    if assumed.time == "gps":
-        ahead_s -= TAI_MINUS_GPS_S
-    return _in_ns(ahead_s)
+    ahead_ns = np.full(len(time_ns), _in_ns(assumed.ahead_s))
+    if assumed.time == "utc":
+        return ahead_ns
+    to_tai_ns = _in_ns(TAI_MINUS_GPS_S if assumed.time == "gps" else 0.0)
+    tai_ns = time_ns - ahead_ns + to_tai_ns
+    # TAI-UTC is that of the UTC day, which begins after the TAI day. By the value of the latter, a
+    # time before midnight may be a leap second too early: it stays in its day.
+    in_day_ns = tai_ns - _tai_minus_utc_ns(tai_ns)
+    return ahead_ns - to_tai_ns + _tai_minus_utc_ns(in_day_ns)
+
+
+def _tai_minus_utc_ns(time_ns: Nanoseconds) -> Nanoseconds:
+    return _in_ns(tai_minus_utc_s(utc_julian_date(time_ns)[0]))
 
 
 def _in_ns(time_s: Array | float) -> Nanoseconds:

@@ -74,6 +74,24 @@ def test_times_of_all_sensors_are_taken_back(piece, by_s, assumed):
     assert found._replace(source=source) == piece
 
 
+@pytest.mark.parametrize(("scale", "before_s"), [("gps", 17), ("tai", 36)])
+def test_times_about_a_leap_second_are_taken_back(scale, before_s, tmp_path):
+    # The last second of 2016 was a leap second: GPS-UTC went from 17 s to 18 s.
+    midnight_ns = int(np.datetime64("2017-01-01", "ns").astype(np.int64))
+    utc_s = np.array([-40, -20, -2, -1, 0, 1, 20, 40])
+    written_s = utc_s + np.where(utc_s < 0, before_s, before_s + 1)
+    with LogWriter(tmp_path / "a.mcap") as log:
+        for k, at_s in enumerate(written_s.tolist()):
+            time_ns = midnight_ns + at_s * 1_000_000_000
+            log.frame("s", time_ns, frame_number=k, exposure_s=0.1, x_px=[], y_px=[])
+    (read,) = read_log_pieces(tmp_path / "a.mcap")
+    found = as_assumed(read, [Assumption(time=scale)])
+    assert ((array(found.exposures, "time") - midnight_ns) / 1e9).tolist() == utc_s.tolist()
+    local = [Assumption(time=scale, ahead_s=-7200.0)]
+    found = as_assumed(later(read, -7200.0, "s"), local)
+    assert ((array(found.exposures, "time") - midnight_ns) / 1e9).tolist() == utc_s.tolist()
+
+
 def test_times_of_one_sensor_are_taken_back_and_no_frame_is_outside_the_log(piece):
     wrong = later(piece, 18.0, "sat2")
     gps = [Assumption(sensor="sat2", time="gps")]
