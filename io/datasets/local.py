@@ -496,9 +496,10 @@ def _folders(staging: Path, pattern: str) -> list[Path]:
 
 
 def _is_alive(run: Path) -> bool:
+    """Return whether the lock of a run is taken; who may only read the dataset can ask too."""
     try:
-        with open(opened(run / LOCK, os.O_RDWR), "r+") as file:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        with open(opened(run / LOCK), "rb") as file:
+            fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
     except BlockingIOError:
         return True
     except FileNotFoundError:

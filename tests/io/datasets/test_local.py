@@ -20,6 +20,7 @@ from epipole.io.datasets.dataset import (
     publish_folders,
     read_table,
 )
+from epipole.io.datasets.lock_record import LockRecord
 from epipole.schemas.errors import DatasetError
 from epipole.schemas.tables import TABLES
 
@@ -201,6 +202,24 @@ def test_a_reader_that_may_not_write_reads_what_is_there(error, tmp_path, monkey
 
     monkeypatch.setattr(local_nights, "opened", refused)
     assert nights_in(tmp_path) == [NIGHT]
+
+
+def test_who_may_only_read_a_dataset_sees_which_nights_are_locked(tmp_path, monkeypatch):
+    open_file = os.open
+
+    def for_reading(path, flags, *more, **named):
+        if flags & (os.O_RDWR | os.O_WRONLY):
+            raise PermissionError(errno.EACCES, "Permission denied", str(path))
+        return open_file(path, flags, *more, **named)
+
+    (tmp_path / ".staging" / "run-0").mkdir(parents=True)
+    (tmp_path / ".staging" / "run-0" / "claim").write_text(LockRecord.of([NEXT_NIGHT]).text())
+    monkeypatch.setattr(os, "open", for_reading)
+    assert locked_nights(tmp_path) == set()  # that run has ended
+    monkeypatch.undo()
+    with lock_nights(tmp_path, [NIGHT]), monkeypatch.context() as patched:
+        patched.setattr(os, "open", for_reading)
+        assert locked_nights(tmp_path) == {NIGHT}
 
 
 def test_a_staging_folder_that_is_a_link_is_not_followed(tmp_path):
