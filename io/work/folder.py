@@ -122,6 +122,11 @@ def clear_unfinished(dataset: str, kept: bool = False) -> list[Unfinished]:
     """Remove the work that stopped runs have left, and return what was removed.
 
     A night on which a run works is left alone. `kept` as for `unfinished_work`.
+
+    Raises
+    ------
+    DatasetError
+        Where something cannot be removed.
     """
     removed = []
     for unfinished in unfinished_work(dataset, kept):
@@ -129,7 +134,11 @@ def clear_unfinished(dataset: str, kept: bool = False) -> list[Unfinished]:
             with lock_nights(dataset, [unfinished.night]):
                 for folder in unfinished.folders:
                     shutil.rmtree(folder, ignore_errors=True)
-        except DatasetError:  # a run has locked it meanwhile
-            continue
+                    if folder.exists():
+                        raise DatasetError(f"{folder}: cannot be removed; see who may write to it")
+        except DatasetError:
+            if unfinished.night in locked_nights(dataset):  # a run has locked it meanwhile
+                continue
+            raise
         removed.append(unfinished)
     return removed

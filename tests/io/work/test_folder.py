@@ -1,5 +1,10 @@
 """Unfinished work: that of stopped runs, never that of a run that goes on."""
 
+import contextlib
+import shutil
+from pathlib import Path
+
+import pytest
 from scenes.busy_folder import N_FILES, busy
 
 from epipole.io.datasets.dataset import lock_nights
@@ -43,3 +48,29 @@ def test_work_of_a_run_that_begins_or_ends_meanwhile_stops_nothing(tmp_path):
         for _ in range(500):
             (found,) = unfinished_work(str(tmp_path))
             assert 5 <= found.size <= 5 + N_FILES
+
+
+def test_work_that_cannot_be_removed_is_not_said_to_be(tmp_path, monkeypatch):
+    left = leave_work(tmp_path, NIGHT)
+    rmtree = shutil.rmtree
+
+    def refuse(folder, **options):  # as the files of another user
+        if Path(folder) != left:
+            rmtree(folder, **options)
+
+    monkeypatch.setattr(shutil, "rmtree", refuse)
+    with pytest.raises(DatasetError, match=f"{left.name}: cannot be removed"):
+        clear_unfinished(str(tmp_path))
+
+
+def test_a_dataset_that_cannot_be_written_is_not_one_without_work(tmp_path, monkeypatch):
+    leave_work(tmp_path, NIGHT)
+
+    @contextlib.contextmanager
+    def refuse(dataset, nights):
+        raise DatasetError(f"{dataset}: cannot be written (Permission denied)")
+        yield
+
+    monkeypatch.setattr("epipole.io.work.folder.lock_nights", refuse)
+    with pytest.raises(DatasetError, match="cannot be written"):
+        clear_unfinished(str(tmp_path))
