@@ -86,7 +86,7 @@ def work_root(dataset: str) -> Path:
     root = cache / "work" if cache is not None else private_folder("work")
     if fault_of(root) is not None:
         root = private_folder("work")
-    return root / hashlib.sha256(dataset.encode()).hexdigest()[:12]
+    return root / hashlib.sha256(dataset.rstrip("/").encode()).hexdigest()[:12]
 
 
 # Unfinished work of stopped runs.

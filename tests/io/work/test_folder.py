@@ -8,7 +8,8 @@ import pytest
 from scenes.busy_folder import N_FILES, busy
 
 from epipole.io.datasets.dataset import lock_nights
-from epipole.io.work.folder import clear_unfinished, unfinished_work
+from epipole.io.work.folder import clear_unfinished, unfinished_work, work_root
+from epipole.schemas.errors import DatasetError
 
 NIGHT, NEXT = "2019-04-01", "2019-04-02"
 
@@ -74,3 +75,8 @@ def test_a_dataset_that_cannot_be_written_is_not_one_without_work(tmp_path, monk
     monkeypatch.setattr("epipole.io.work.folder.lock_nights", refuse)
     with pytest.raises(DatasetError, match="cannot be written"):
         clear_unfinished(str(tmp_path))
+
+
+def test_a_url_with_a_slash_at_its_end_is_the_same_dataset(tmp_path, monkeypatch):
+    monkeypatch.setenv("EPIPOLE_CACHE", str(tmp_path / "cache"))
+    assert work_root("memory://nights/ds/") == work_root("memory://nights/ds")
