@@ -8,9 +8,9 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 
+from epipole.flows.night.log_choice import find_logs
 from epipole.flows.night.summary import many
 from epipole.io.caches.private_folders import temporary_folder
-from epipole.io.logs.listing import list_logs
 from epipole.io.logs.messages.cameras import PINHOLE_TERMS
 from epipole.io.logs.writer import distortion_of
 from epipole.io.work.work_layout import ReadFolder
@@ -60,9 +60,9 @@ def calibrate(
     Raises
     ------
     LogError
-        Where a file is not a log, or the logs have no frames.
+        Where a file that is named is not a log, or the logs have no frames.
     """
-    paths = [log for where in logs for log in list_logs(where)[0]]
+    paths = find_logs(logs, None).paths
     with temporary_folder("calibrate") as made:
         folder = ReadFolder(made)
         read = [

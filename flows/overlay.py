@@ -13,6 +13,7 @@ import polars as pl
 import pyarrow as pa
 from foxglove_schemas_protobuf.Log_pb2 import Log
 
+from epipole.flows.night.log_choice import find_logs
 from epipole.io.datasets.dataset import night_row, nights_in, read_table
 from epipole.io.datasets.rows_by_night import nights_of
 from epipole.io.logs.listing import list_logs
@@ -102,8 +103,9 @@ def overlay(
     EpipoleError
         Where the dataset has no night of the logs, or the file is one of them or cannot be written.
     """
-    paths = [path for where in logs for path in list_logs(where)[0]]
-    if is_one_of(out, paths):
+    paths = find_logs(logs, None).paths
+    listed = [path for where in logs for path in list_logs(where)[0]]
+    if is_one_of(out, listed):
         raise LogError(f"{out}: is one of the logs, and would be lost; give another file to write")
     given = _Logs(paths, assume)
     nights = [date for date in nights_in(dataset) if date in given.nights and night in (None, date)]

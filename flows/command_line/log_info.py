@@ -8,7 +8,24 @@ import pyarrow.compute as pc
 
 from epipole.io.logs.reader import read_log
 from epipole.schemas.bridge import array, flatten
+from epipole.schemas.errors import LogError
 from epipole.tasks.common.sightings import camera_of
+
+
+def describe_found(log: str, is_named: bool) -> dict[str, Any]:
+    """Return what `describe` does; of a file that was found and cannot be read, why it cannot.
+
+    Raises
+    ------
+    LogError
+        Where a file that was named itself cannot be read.
+    """
+    try:
+        return describe(log)
+    except LogError as error:
+        if is_named:
+            raise
+        return {"log": log, "error": str(error)}
 
 
 def describe(log: str) -> dict[str, Any]:
@@ -76,7 +93,9 @@ def _iso(time_ns: int) -> str:
 
 
 def lines(described: dict[str, Any]) -> list[str]:
-    """Return what `describe` returned as lines for people."""
+    """Return what `describe_found` returned as lines for people."""
+    if "error" in described:
+        return [described["error"]]
     out = [f"{described['log']}: {described['size']:,} bytes"]
     for sensor in described["sensors"]:
         rate = f" at {sensor['rate_hz']:.3g} Hz" if sensor["rate_hz"] else ""

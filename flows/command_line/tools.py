@@ -338,16 +338,25 @@ def settings() -> None:
 
 
 def info(logs: Logs, as_json: AsJson = False) -> None:
-    """Show what is in logs: sensors, times, counts, and what cannot be used."""
-    from epipole.flows.command_line.log_info import describe, lines
+    """Show what is in logs: sensors, times, counts, and what cannot be used.
+
+    A file in a folder that cannot be read has a line, and the others are shown. It exits with 1
+    then.
+    """
+    from epipole.flows.command_line.log_info import describe_found, lines
     from epipole.io.logs.listing import list_logs
 
-    paths = dict.fromkeys(log for where in logs for log in list_logs(where)[0])
-    described = [describe(log) for log in paths]
+    is_named: dict[str, bool] = {}
+    for where in logs:
+        found, is_one = list_logs(where)
+        is_named |= {log: is_one or is_named.get(log, False) for log in found}
+    described = [describe_found(log, named) for log, named in is_named.items()]
     if as_json:
         print_json(described)
     else:
         print_lines(line for log in described for line in lines(log))
+    if any("error" in log for log in described):
+        sys.exit(1)
 
 
 def doctor(logs: Logs, assume: Assume = None, as_json: AsJson = False) -> None:

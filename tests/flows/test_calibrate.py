@@ -2,7 +2,9 @@
 
 import pytest
 
-from epipole.flows.calibrate import calibration_message, lines
+from epipole.flows.calibrate import calibrate, calibration_message, lines
+from epipole.io.logs.writer import LogWriter
+from epipole.schemas.errors import LogError
 from epipole.tasks.algorithms.geometry.camera import Camera
 from epipole.tasks.calibrate.calibrate_unknown import CameraReport
 
@@ -27,3 +29,14 @@ def test_the_calibration_to_write_has_the_time_from_row_to_row():
     for camera, expected in ((rolling, -2e-5), (CAMERA, None)):
         report = CameraReport("a", camera, 1.1, True, True, camera, {}, 3, 3, 90, 0.1)
         assert calibration_message(report).get("line_time_s") == expected
+
+
+def test_a_broken_file_in_a_folder_is_left_out_as_in_a_run(tmp_path, caplog):
+    (tmp_path / "broken.mcap").write_bytes(b"not a log")
+    with LogWriter(tmp_path / "n.mcap") as log:
+        log.frame("a", 10**18, frame_number=0, exposure_s=0.1, x_px=[1.0], y_px=[2.0])
+    (report,) = calibrate([str(tmp_path)], 12.0)
+    assert (report.sensor_id, report.n_frames, report.camera) == ("a", 1, None)
+    assert "broken.mcap: not an MCAP file" in caplog.text
+    with pytest.raises(LogError, match=r"broken\.mcap: not an MCAP file"):
+        calibrate([str(tmp_path), str(tmp_path / "broken.mcap")], 12.0)

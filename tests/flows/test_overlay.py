@@ -245,6 +245,17 @@ def test_logs_are_read_as_their_run_assumed(night_log, night_dataset, tmp_path):
     assert (told["frames"], told["without_rows"]) == (240, 0)
 
 
+def test_a_broken_file_in_the_folder_of_the_logs_is_left_out(night_log, night_dataset, tmp_path):
+    folder = tmp_path / "logs"
+    folder.mkdir()
+    (folder / "broken.mcap").write_bytes(b"not a log")
+    (folder / "night.mcap").symlink_to(night_log)
+    made = overlay(str(night_dataset), [str(folder)], tmp_path / "x.mcap")
+    assert (made.frames, made.without_rows) == (240, 0)
+    with pytest.raises(LogError, match="is one of the logs, and would be lost"):
+        overlay(str(night_dataset), [str(folder)], folder / "broken.mcap")
+
+
 def test_a_log_is_not_replaced_by_its_overlay(night_log, night_dataset, tmp_path):
     log = tmp_path / "a.mcap"
     shutil.copy(night_log, log)

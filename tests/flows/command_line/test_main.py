@@ -193,6 +193,24 @@ def test_info_says_what_a_log_holds(epipole, night_log):
     assert epipole("info", night_log.parent, night_log)[1] == out  # each log once
 
 
+def test_info_shows_the_other_logs_of_a_folder_with_a_broken_file(epipole, night_log, tmp_path):
+    folder = tmp_path / "logs"
+    folder.mkdir()
+    (folder / "broken.mcap").write_bytes(b"not a log")
+    (folder / "night.mcap").symlink_to(night_log)
+    code, out, err = epipole("info", "logs")
+    assert (code, err) == (1, "")
+    assert "broken.mcap: not an MCAP file" in out
+    assert out.count("frames       60 at 1 Hz") == 4
+    code, out, _ = epipole("info", "logs", "--json")
+    assert [("error" in log, len(log.get("sensors", []))) for log in json.loads(out)] == [
+        (True, 0), (False, 4),
+    ]  # fmt: skip
+    code, out, err = epipole("info", "logs", "logs/broken.mcap")  # named: a mistake
+    assert (code, out) == (1, "")
+    assert "broken.mcap: not an MCAP file" in err
+
+
 def test_info_says_what_cannot_be_used(epipole, tmp_path):
     with LogWriter(tmp_path / "n.mcap") as log:
         for k, x in enumerate([[1.0], [np.nan]]):
