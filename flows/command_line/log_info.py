@@ -9,6 +9,7 @@ import pyarrow.compute as pc
 from epipole.io.logs.reader import read_log
 from epipole.schemas.bridge import array, flatten
 from epipole.schemas.errors import LogError
+from epipole.schemas.work_tables import LogContents
 from epipole.tasks.common.sightings import camera_of
 
 
@@ -43,7 +44,7 @@ def describe(log: str) -> dict[str, Any]:
         "sha256": contents.source.sha256,
         "sensors": [
             _sensor(name, contents.exposures, contents.states, contents.cameras)
-            for name in sorted({*sensor_ids(contents.exposures), *sensor_ids(contents.states)})
+            for name in _sensors(contents)
         ],
         "left_out": [
             {"reason": row["reason"], "sensor_id": row["sensor_id"], "count": row["count_sum"]}
@@ -53,6 +54,12 @@ def describe(log: str) -> dict[str, Any]:
             .to_pylist()
         ],
     }
+
+
+def _sensors(contents: LogContents) -> list[str]:
+    """Return the sensors of which a log has anything; of some it may have a calibration alone."""
+    rows = contents.exposures, contents.states, contents.cameras
+    return sorted({name for each in rows for name in sensor_ids(each)})
 
 
 def sensor_ids(rows: pa.Table) -> list[str]:
@@ -118,7 +125,7 @@ def _times(sensor: dict[str, Any]) -> str:
 
 def _states(sensor: dict[str, Any]) -> str:
     if not sensor["states"]:
-        return "none; the frames give no positions"
+        return "none in this log; frames without any give no positions"
     n = sensor["states"]
     return (
         f"{n:,} in {', '.join(sensor['state_frames'])}, "
@@ -133,6 +140,6 @@ def _share(count: int, total: int) -> str:
 
 def _calibration(sensor: dict[str, Any]) -> str:
     if sensor["image_px"] is None:
-        return "none; a run leaves this sensor out"
+        return "none in this log; a run leaves a sensor without any out"
     width, height = sensor["image_px"]
     return f"{width} x {height} px, {sensor['field_deg'][0]:.1f} x {sensor['field_deg'][1]:.1f} deg"

@@ -216,11 +216,22 @@ def test_info_says_what_cannot_be_used(epipole, tmp_path):
         for k, x in enumerate([[1.0], [np.nan]]):
             log.frame("a", START_NS + k, frame_number=k, exposure_s=0.1, x_px=x, y_px=[2.0])
     _, out, _ = epipole("info", "n.mcap")
-    assert "states       none; the frames give no positions" in out
-    assert "calibration  none; a run leaves this sensor out" in out
+    assert "states       none in this log; frames without any give no positions" in out
+    assert "calibration  none in this log; a run leaves a sensor without any out" in out
     assert re.search(r"left out: 1 \w+ of a", out)
     _, as_json, _ = epipole("info", "n.mcap", "--json")
     assert json.loads(as_json)[0]["sensors"][0]["frames"] == 1
+
+
+def test_info_shows_a_log_that_has_calibrations_alone(epipole, tmp_path):
+    # Recorders that write frames, states and calibrations to separate files are usual.
+    with LogWriter(tmp_path / "n.mcap") as log:
+        camera = dict.fromkeys(("k1", "k2", "p1", "p2", "k3"), 0.0)
+        camera |= {"width": 512, "height": 256, "fx_px": 1e3, "fy_px": 1e3}
+        log.camera("a", START_NS, camera | {"cx_px": 255.5, "cy_px": 127.5})
+    _, out, _ = epipole("info", "n.mcap")
+    assert "  a\n    frames       0\n" in out
+    assert "calibration  512 x 256 px" in out
 
 
 def test_simulate_writes_a_constellation_to_a_folder(epipole):
