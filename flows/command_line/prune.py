@@ -30,7 +30,13 @@ def prune(
     Nights go with their reports and the records of their runs. A night on which a run
     works stays. The night after the last one removed is stale from then on.
     """
-    from epipole.io.datasets.dataset import locked_nights, remove, require_dataset, sizes
+    from epipole.io.datasets.dataset import (
+        finish_publication,
+        locked_nights,
+        remove,
+        require_dataset,
+        sizes,
+    )
     from epipole.io.work.folder import clear_unfinished, unfinished_work
 
     check_night(nights, "--nights")
@@ -38,6 +44,8 @@ def prune(
     if nights is None and reports is None and not work:
         raise typer.BadParameter("say what: --nights DATE, --reports DATE or --work")
     require_dataset(dataset)
+    if yes:  # else a later run or reader would put back what a stopped one has published
+        finish_publication(dataset)
     found = sizes(dataset)
     locked = locked_nights(dataset) if nights is not None else set()
     stay = sorted({date for date in map(_date, found) if date in locked and date < (nights or "")})

@@ -4,10 +4,14 @@ import json
 import shutil
 
 import pytest
+from scenes.dataset_tables import TIMES, night_tables
+from scenes.published import publish
 from typer.testing import CliRunner
 
 from epipole.flows.command_line.main import app
 from epipole.io.datasets.dataset import lock_nights, nights_in
+from epipole.io.datasets.object_store import StoreNights
+from epipole.schemas.errors import DatasetError
 
 NIGHT, NEXT = "2019-04-01", "2019-04-02"
 
@@ -73,6 +77,21 @@ def test_a_night_that_is_locked_meanwhile_is_not_removed(dataset, monkeypatch):
         said = prune(dataset, "--nights", NEXT, "--yes", code=1)
     assert "has worked on it since" in said
     assert nights_in(str(dataset)) == [NIGHT, NEXT]
+
+
+def test_a_night_that_a_stopped_run_has_published_does_not_come_back(monkeypatch):
+    out = "memory://pruned/ds"
+
+    def stop(*_):
+        raise PermissionError("stopped")
+
+    with monkeypatch.context() as patched:
+        patched.setattr(StoreNights, "_finish", stop)
+        with pytest.raises(DatasetError, match="published, but not all files are in place"):
+            publish(out, night_tables(TIMES), [NIGHT])
+    assert nights_in(out) == [NIGHT]
+    assert f"MiB  night={NIGHT}\n" in prune(out, "--nights", NEXT, "--yes")
+    assert nights_in(out) == []
 
 
 def test_it_asks_what(dataset):
