@@ -4,6 +4,7 @@ They come from a TOML file or from flow parameters. They are passed in, never re
 """
 
 import hashlib
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Literal, Self
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
@@ -569,4 +570,18 @@ def _contradiction(settings: Settings) -> str | None:
             f"association.min_altitude_km = {association.min_altitude_km:g} is not below "
             f"association.max_range_km = {association.max_range_km:g}"
         )
+    return _assumed_twice(settings.sensors.assume)
+
+
+# Of several assumptions of a sensor these would all be taken back, one after the other.
+_ADD_UP = ("time", "frame_time", "position_unit", "position_sigma_unit", "velocity_unit")
+
+
+def _assumed_twice(assumed: Sequence[Assumption]) -> str | None:
+    """Return what is assumed of a sensor more than once; None: nothing is."""
+    usual = Assumption()
+    for name in _ADD_UP:
+        of = [each.sensor for each in assumed if getattr(each, name) != getattr(usual, name)]
+        if len(of) > (1 if EVERY_SENSOR in of else len(set(of))):
+            return f"sensors.assume: {name} is assumed twice of a sensor ({', '.join(of)})"
     return None

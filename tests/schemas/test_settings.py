@@ -70,3 +70,23 @@ def test_a_flow_gets_the_same_checks():
 def test_a_misspelt_or_misplaced_setting_has_a_suggestion(values, meant):
     with pytest.raises(SettingsError, match=rf"did you mean {meant}\?"):
         validate_settings(values, "settings.toml")
+
+
+@pytest.mark.parametrize(
+    "assume",
+    [
+        '[{ time = "gps" }, { sensor = "a", time = "gps" }]',
+        '[{ sensor = "a", position_unit = "m" }, { sensor = "a", position_unit = "m" }]',
+        '[{ sensor = "a", frame_time = "start" }, { frame_time = "end" }]',
+    ],
+)
+def test_what_would_be_taken_back_twice_is_refused(assume):
+    with pytest.raises(SettingsError, match=r"here: sensors\.assume: \w+ is assumed twice of a"):
+        parse_settings(f"[sensors]\nassume = {assume}", "here")
+
+
+def test_assumptions_of_different_sensors_or_things_are_taken():
+    two = '{ sensor = "a", time = "gps" }, { sensor = "b", time = "gps" }'
+    rest = '{ ahead_s = 1.0 }, { states = "TEME" }, { sensor = "a", states = "GCRF" }'
+    found = parse_settings(f"[sensors]\nassume = [{two}, {rest}]", "here")
+    assert len(found.sensors.assume) == 5
