@@ -32,6 +32,11 @@ def stop_by_signals() -> None:
         signal.signal(by, _stop)
 
 
+def is_stopping() -> bool:
+    """Return whether a signal has come. Its exception may have been replaced by another one."""
+    return bool(_stopped_by)
+
+
 @contextlib.contextmanager
 def stopped_in_one_line() -> Iterator[None]:
     """Turn any exception after a signal into one line and the shell's exit code.

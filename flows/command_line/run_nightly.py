@@ -3,11 +3,13 @@
 import contextlib
 import logging
 import time
+import traceback
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from epipole.flows.command_line.process import is_stopping
 from epipole.flows.command_line.terminal import shown
 from epipole.flows.night.log_choice import find_logs
 from epipole.flows.night.progress import compile_step, prepare
@@ -135,10 +137,12 @@ class Nights:
                     if summary is None:
                         make = make or self._start(started)
                         summary = make(night)
-                except EpipoleError as failed:
-                    if alone:
+                except Exception as failed:  # whatever it is
+                    if alone or is_stopping():
                         raise
-                    error = None if isinstance(failed, NoFramesError) else str(failed)
+                    if not isinstance(failed, EpipoleError):  # a fault of the program
+                        traceback.print_exc()
+                    error = None if isinstance(failed, NoFramesError) else line_of(failed)
                 yield Ended(night, summary, time.monotonic() - begun, error)
 
     def stale(self) -> Iterator[str]:

@@ -93,6 +93,29 @@ def test_a_night_that_fails_does_not_stop_the_next(night_run, night_log, monkeyp
     ]  # fmt: skip
 
 
+def test_an_unforeseen_error_of_a_night_does_not_stop_the_next_either(
+    night_run, night_log, monkeypatch
+):
+    import epipole.flows.command_line.run_nightly as started
+
+    real = started.unchanged_nights
+
+    def fail(dataset, given, night, *rest):
+        if night == "2019-03-31":
+            raise RuntimeError("a bug")
+        return real(dataset, given, night, *rest)
+
+    monkeypatch.setattr(started, "unchanged_nights", fail)
+    code, text = run(night_log, "--out", night_run[0], "--night", "2019-03-31", "--to", NIGHT)
+    assert code == 1
+    assert text.splitlines() == [
+        "2019-03-31  failed: a bug", "2019-04-01  unchanged", "1 failed, 1 unchanged",
+    ]  # fmt: skip
+    monkeypatch.setattr(started, "is_stopping", lambda: True)  # as an error that Ctrl-C has made
+    code, text = run(night_log, "--out", night_run[0], "--night", "2019-03-31", "--to", NIGHT)
+    assert (code, text) == (1, "")
+
+
 @pytest.mark.parametrize(
     ("options", "says"),
     [
