@@ -50,14 +50,15 @@ def run(
         typer.Option(metavar="DATE", help="With --night: every night to this one, one by one."),
     ] = None,
     last_nights: Annotated[
-        int,
+        int | None,
         typer.Option(
             min=1,
             max=366,
             metavar="N",
-            help=f"With --night {YESTERDAY}: the last N nights, where one has changed.",
+            help=f"With --night {YESTERDAY}: the last N nights, where one has changed; "
+            f"default: {LAST_NIGHTS}.",
         ),
-    ] = LAST_NIGHTS,
+    ] = None,
     stale: Annotated[
         bool,
         typer.Option(
@@ -144,10 +145,13 @@ def _early_server(out: str, night: str | None, again: bool) -> Launched | None:
     return launch({}) if again or not any(Path(out).glob(pattern)) else None
 
 
-def _dates(night: str | None, to: str | None, last_nights: int) -> Sequence[str | None]:
+def _dates(night: str | None, to: str | None, last_nights: int | None) -> Sequence[str | None]:
     """Return the nights that are asked for, in order; None: every night of the logs."""
     if night == YESTERDAY and to is None:
-        return nights_before(datetime.datetime.now(datetime.UTC).date().isoformat(), last_nights)
+        today = datetime.datetime.now(datetime.UTC).date().isoformat()
+        return nights_before(today, last_nights or LAST_NIGHTS)
+    if last_nights is not None:
+        raise typer.BadParameter(f"give it with --night {YESTERDAY}", param_hint="--last-nights")
     check_night(night)
     if to is None:
         return [night]

@@ -123,6 +123,8 @@ def test_an_unforeseen_error_of_a_night_does_not_stop_the_next_either(
         (["--night", NIGHT, "--to", "2019-03-31"], "is before"),
         (["--night", NIGHT, "--to", "tomorrow"], "is not a date"),
         (["--night", NIGHT, "--stale"], "it chooses the nights"),
+        (["--night", NIGHT, "--last-nights", "2"], "give it with --night yesterday"),
+        (["--last-nights", "2"], "give it with --night yesterday"),
     ],
 )
 def test_a_range_that_is_none_is_refused(night_log, tmp_path, options, says):
