@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
 import typer
 
-from epipole.flows.command_line.options import AsJson, print_json, print_lines
+from epipole.flows.command_line.options import AsJson, Assume, print_json, print_lines
 
 if TYPE_CHECKING:  # imported when the command runs
     from epipole.flows.night.recorded_nights import PublishedNight
@@ -24,6 +24,7 @@ def nights(
     settings: Annotated[
         Path | None, typer.Option(metavar="FILE", help="Settings of the next run, in TOML.")
     ] = None,
+    assume: Assume = None,
     known: Annotated[
         str | None,
         typer.Option(metavar="FILE", help="Catalogue of known objects of the next run."),
@@ -50,10 +51,12 @@ def nights(
     from epipole.io.datasets.dataset import require_dataset
     from epipole.io.settings_file import read_settings
     from epipole.io.work.folder import clear_unfinished, unfinished_work
+    from epipole.schemas.given_settings import with_assumptions
     from epipole.schemas.settings import Settings
 
     require_dataset(dataset)
-    today = read_settings(settings) if settings else Settings()
+    written = read_settings(settings) if settings else Settings()
+    today = with_assumptions(written, assume or ())
     known_key = read_known_objects(known).sha256 if known else None
     published = {n.date: n for n in published_nights(dataset, today, known_key)}
     records = read_records(dataset)
