@@ -48,6 +48,7 @@ def nights(
     from epipole.flows.night.recorded_nights import published_nights
     from epipole.flows.night.run_records import all_dates, read_records
     from epipole.io.catalogues.element_sets import read_known_objects
+    from epipole.io.catalogues.star_catalogue import check_star_catalogue
     from epipole.io.datasets.dataset import require_dataset
     from epipole.io.settings_file import read_settings
     from epipole.io.work.folder import clear_unfinished, unfinished_work
@@ -57,6 +58,7 @@ def nights(
     require_dataset(dataset)
     written = read_settings(settings) if settings else Settings()
     today = with_assumptions(written, assume or ())
+    check_star_catalogue(today.identification.catalogue)
     known_key = read_known_objects(known).sha256 if known else None
     published = {n.date: n for n in published_nights(dataset, today, known_key)}
     records = read_records(dataset)

@@ -20,3 +20,9 @@ def stale(*arguments) -> list[list[str]]:
 def test_logs_that_the_next_run_reads_otherwise_make_a_night_stale(night_dataset):
     assert stale(night_dataset) == [[]]
     assert stale(night_dataset, "--assume", "*.ahead_s=1") == [["other settings"]]
+
+
+def test_settings_with_a_catalogue_that_is_missing_are_refused_in_one_line(night_dataset, tmp_path):
+    (tmp_path / "s.toml").write_text('[identification]\ncatalogue = "gone.parquet"\n')
+    ended = nights(night_dataset, "--settings", tmp_path / "s.toml", code=1)
+    assert "gone.parquet: no such catalogue file" in ended.output
