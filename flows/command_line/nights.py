@@ -1,5 +1,7 @@
 """`epipole nights`: what is in a dataset."""
 
+import itertools
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
@@ -13,6 +15,8 @@ if TYPE_CHECKING:  # imported when the command runs
 HEADINGS = ("night", "frames", "stars", "objects", "positions", "left out", "")
 WIDTHS = (10, 11, 10, 9, 11, 10)
 INDENT = " " * 12
+NOT_RUN = "not run"  # nobody has asked for the date
+MAX_NOT_RUN = 60  # such dates in succession; more are one line: a sensor's clock may say 1980
 
 
 def nights(
@@ -78,13 +82,23 @@ def nights(
         )
         return
     print_lines(_line(HEADINGS) for _ in found[:1])
-    print_lines(line for night in found for line in night.lines(runs))
+    print_lines(_lines(found, runs))
     if not found:
         print_lines(["no night is stale" if stale else "no nights"])
     what = "removed" if clear else "unfinished; the next run continues it, --clear removes it"
     print_lines(
         f"{u.night}  {u.size / 2**20:,.0f} MiB of a stopped run: {what}" for u in unfinished
     )
+
+
+def _lines(found: "Sequence[_Listed]", runs: bool) -> Iterator[str]:
+    """Return the dates as people read them."""
+    for is_idle, dates in itertools.groupby(found, lambda each: each.state == NOT_RUN):
+        listed = list(dates)
+        if is_idle and len(listed) > MAX_NOT_RUN:
+            yield f"{listed[0].date} to {listed[-1].date}  {NOT_RUN}"
+        else:
+            yield from (line for night in listed for line in night.lines(runs))
 
 
 class _Listed(NamedTuple):
@@ -97,7 +111,7 @@ class _Listed(NamedTuple):
     @property
     def state(self) -> str:
         """How its last run ended; no night and no record: nobody has asked for it."""
-        return self.record.get("state") or ("made" if self.night else "not run")
+        return self.record.get("state") or ("made" if self.night else NOT_RUN)
 
     def as_dict(self) -> dict[str, Any]:
         """Return the date as JSON takes it."""

@@ -1,6 +1,7 @@
 """`epipole nights`: which nights the settings of the next run would make otherwise."""
 
 import json
+import shutil
 
 from typer.testing import CliRunner
 
@@ -26,3 +27,15 @@ def test_settings_with_a_catalogue_that_is_missing_are_refused_in_one_line(night
     (tmp_path / "s.toml").write_text('[identification]\ncatalogue = "gone.parquet"\n')
     ended = nights(night_dataset, "--settings", tmp_path / "s.toml", code=1)
     assert "gone.parquet: no such catalogue file" in ended.output
+
+
+def test_decades_without_a_night_are_one_line(night_dataset, tmp_path):
+    # A sensor whose clock was never set writes 1980, where GPS begins.
+    out = shutil.copytree(night_dataset, tmp_path / "out")
+    shutil.copytree(out / "night=2019-04-01", out / "night=1980-01-06")
+    shutil.copytree(out / "night=2019-04-01", out / "night=2019-04-04")
+    shown = nights(out).stdout.splitlines()
+    assert [line.split("  ")[0] for line in shown if line[:2] in ("19", "20")] == [
+        "1980-01-06", "1980-01-07 to 2019-03-31", "2019-04-01", "2019-04-02", "2019-04-03",
+        "2019-04-04",
+    ]  # fmt: skip
