@@ -27,6 +27,12 @@ from epipole.io.paths import LONGEST_PATH, known_as
 from epipole.schemas.errors import EpipoleError
 from epipole.schemas.text import LONGEST_LINE, as_line, without_secrets
 
+# Errors of files that a user can put right, wherever they are met.
+_OF_USERS = {
+    errno.ENAMETOOLONG: "the name is too long; give a shorter one",
+    errno.EACCES: "may not be read or written; see who may enter its folder",
+}
+
 
 class _Commands(typer.core.TyperGroup):
     """Commands that end in one line where the user can put the error right."""
@@ -49,9 +55,9 @@ class _Commands(typer.core.TyperGroup):
         except EpipoleError as error:
             _fail(str(error))
         except OSError as error:
-            if error.errno != errno.ENAMETOOLONG:
+            if (says := _OF_USERS.get(error.errno or 0)) is None:
                 raise
-            _fail(f"{as_line(error.filename, 60)}: the name is too long; give a shorter one")
+            _fail(f"{as_line(error.filename, 60)}: {says}")
 
 
 def _fail(message: str) -> NoReturn:

@@ -1,5 +1,6 @@
 """The command line: what it prints, and one clear line where it could not do its work."""
 
+import errno
 import json
 import os
 import re
@@ -361,3 +362,13 @@ def test_an_unchanged_night_is_found_without_prefect():
         "assert 'prefect' not in sys.modules\n"
     )
     subprocess.run([sys.executable, "-c", code], check=True)
+
+
+def test_a_file_in_a_folder_that_may_not_be_entered_is_one_line(epipole, night_log, monkeypatch):
+    def refuse(where):  # as Path.is_file does, for all users but root
+        raise PermissionError(errno.EACCES, "Permission denied", where)
+
+    monkeypatch.setattr("epipole.io.catalogues.element_sets._bytes_of", refuse)
+    code, out, err = epipole("run", night_log, "--out", "out", "--known", "closed/a.tle")
+    assert (code, out) == (1, "")
+    assert "closed/a.tle: may not be read or written" in one_line(err)
