@@ -17,7 +17,8 @@ from epipole.schemas.columns import ATTRIBUTABLE_AXES
 from epipole.schemas.settings import TrackletSettings
 from epipole.schemas.spans import Span
 from epipole.schemas.work_tables import ATTRIBUTABLES, SIGHTINGS
-from epipole.tasks.algorithms.constants import ARCSEC, GM_KM3_S2, SECOND_NS
+from epipole.tasks.algorithms.constants import ARCSEC, SECOND_NS
+from epipole.tasks.algorithms.earth_gravity import propagate_states
 from epipole.tasks.algorithms.geometry.covariances import (
     attitude_covariance,
     centroid_covariance,
@@ -58,6 +59,8 @@ from epipole.tasks.common.sightings import (
 TRAIL_RAD_S, MIN_TRAILS = np.radians(0.1), 5
 # And those that show one in the image: slower ones leave trails of a tenth of a pixel or two.
 IMAGE_TRAIL_RAD_S = np.radians(0.02)
+# Of the way from a frame to a time near it: right to a metre over a minute of a low orbit.
+STEPS_TO_FRAME = 2
 
 
 class TrackletSightings(NamedTuple):
@@ -529,7 +532,8 @@ def _mean_magnitudes(sightings: SensorSightings, number: Indices) -> dict[str, A
 def states_near_frames(frames: Frames, served: Indices, dt_s: Array) -> tuple[Array, Array]:
     """Return the sensor's positions and velocities at times near frames, from those at the frames.
 
-    Gravity is included: in one second it moves a satellite by 4 m.
+    Under the Earth's gravity; what stands on the ground does not fall. An unknown velocity
+    counts as zero, and stays unknown.
 
     Parameters
     ----------
@@ -539,9 +543,8 @@ def states_near_frames(frames: Frames, served: Indices, dt_s: Array) -> tuple[Ar
         Time of the frame minus the given time [s].
     """
     r, v = frames.r_gcrf_km[served], frames.v_gcrf_km_s[served]
-    back = -dt_s[:, None]
-    gravity = -GM_KM3_S2 * r / lengths(r)[:, None] ** 3
-    return r + np.nan_to_num(v) * back + gravity * back**2 / 2, v + gravity * back
+    moved, faster = propagate_states(r, np.nan_to_num(v), -dt_s, STEPS_TO_FRAME)
+    return moved, np.where(np.isnan(v), np.nan, faster)
 
 
 def _on_sky(u: Array, cov: Array) -> Array:

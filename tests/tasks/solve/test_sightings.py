@@ -14,8 +14,10 @@ from epipole.schemas.work_tables import SOLUTIONS, TRACKLET_RUNS
 from epipole.tasks.algorithms.constants import ARCSEC, SPEED_OF_LIGHT_KM_S
 from epipole.tasks.algorithms.geometry.camera import Camera, unproject
 from epipole.tasks.algorithms.geometry.directions import radec_from_unit
+from epipole.tasks.algorithms.orbits.orbit_fit import trajectory
 from epipole.tasks.solve.sightings import (
     sight_objects,
+    states_near_frames,
     tabulate_attributables,
     tabulate_sightings,
     with_middle_in,
@@ -221,3 +223,28 @@ def test_the_mean_magnitude_has_the_scatter_of_the_detections():
     assert row["magnitude_scatter"] == pytest.approx(magnitude.std(ddof=1))
     assert row["magnitude_sigma"] == pytest.approx(magnitude.std(ddof=1) / np.sqrt(N))
     assert attributable().to_pylist()[0]["magnitude"] is None
+
+
+def test_a_sensor_on_the_ground_does_not_fall_between_its_frames():
+    """Its frames are ten seconds apart: free fall in half of that would be 120 m."""
+    frames = sighting(
+        **unstack("{}_km", np.tile([6371.0, 0.0, 0.0], (N, 1))),
+        **unstack("v{}_km_s", np.tile([0.0, 0.46, 0.0], (N, 1))),
+    ).frames
+    r_km, v_km_s = states_near_frames(frames, np.array([7]), np.array([-5.0]))
+    np.testing.assert_allclose(r_km[0], [6371.0, 2.3, 0.0], atol=1e-9)
+    np.testing.assert_allclose(v_km_s[0], [0.0, 0.46, 0.0], atol=1e-9)
+
+
+@pytest.mark.parametrize("dt_s", [-60.0, -30.0, 0.5, 30.0])
+def test_a_satellite_stays_on_its_orbit_far_from_its_frames(dt_s):
+    """A parabola is 36 m off after half a minute: its frames may be a minute apart."""
+    low = np.array([6900.0, 0.0, 0.0, 0.0, 5.4, 5.4])
+    frames = sighting(
+        **unstack("{}_km", np.tile(low[:3], (N, 1))),
+        **unstack("v{}_km_s", np.tile(low[3:], (N, 1))),
+    ).frames
+    r_km, v_km_s = states_near_frames(frames, np.array([7]), np.array([dt_s]))
+    true = trajectory(low, np.array([-dt_s]))[0][0]
+    np.testing.assert_allclose(r_km[0], true[:3], atol=1e-3)
+    np.testing.assert_allclose(v_km_s[0], true[3:], atol=1e-4)
