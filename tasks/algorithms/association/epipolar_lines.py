@@ -12,6 +12,7 @@ import numpy as np
 
 from epipole.schemas.arrays import Array, Indices
 from epipole.tasks.algorithms.association.samples import FREE, Groups, Samples
+from epipole.tasks.algorithms.association.search.seeds import SHORTEST_BASELINE_KM
 from epipole.tasks.algorithms.geometry.directions import skew
 
 Pairs = Mapping[tuple[int, int], Indices]
@@ -89,6 +90,8 @@ def pair_images(
 ) -> dict[tuple[int, int], Indices]:
     """Return the pairs of points of every two of s images, the earlier image first.
 
+    Two images from one position have no pairs.
+
     Parameters
     ----------
     images_px
@@ -105,6 +108,10 @@ def pair_images(
     out = {}
     for a in range(len(images_px)):
         for b in range(a + 1, len(images_px)):
+            # Without a baseline there are no lines: any two points would be a pair.
+            if np.linalg.norm(r_km[b] - r_km[a]) < SHORTEST_BASELINE_KM:
+                out[a, b] = np.zeros((0, 2), np.int64)
+                continue
             F = fundamental_matrix(
                 M[a], R_sensor_from_icrs[a], r_km[a], M[b], R_sensor_from_icrs[b], r_km[b]
             )

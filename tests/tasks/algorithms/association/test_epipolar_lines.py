@@ -9,6 +9,7 @@ from epipole.tasks.algorithms.association.epipolar_lines import (
     fundamental_matrix,
     intersect_sights,
     line_distances,
+    pair_images,
     pair_points,
     view_table,
 )
@@ -97,3 +98,23 @@ def test_tracklets_are_grouped_as_their_points_are_paired():
     crowded = Scene(3, 4).objects(20).strays(50)
     precision, _ = judge(crowded, associate_by_lines(crowded.samples(), focal_px, 10.0))
     assert precision < 0.7  # the false points that happen to lie on a line
+
+
+@pytest.mark.parametrize("apart_km", [0.0, 0.001])
+def test_two_cameras_of_one_satellite_do_not_spoil_the_table(apart_km):
+    """Their baseline shows no lines. Each object has the third sensor and one of the two."""
+    rng = np.random.default_rng(1)
+    x = GEO + rng.normal(size=(8, 3)) * 200
+    r_km = np.array([R_1, R_1 + apart_km, R_2])
+    R = np.stack([attitude(look(r, GEO), k) for k, r in enumerate(r_km)])
+    shown = [rng.permutation(8) for _ in r_km]
+    images = [
+        image(A, r, x[order]) + rng.normal(size=(8, 2)) * 0.05
+        for A, r, order in zip(R, r_km, shown, strict=True)
+    ]
+    table = view_table([8] * 3, pair_images(images, np.stack([M] * 3), R, r_km, 1.0))
+    right = [
+        len({int(shown[k][point]) for k, point in enumerate(row) if point >= 0}) for row in table
+    ]
+    assert right.count(1) >= 7
+    assert right.count(1) == len(right)
