@@ -232,8 +232,11 @@ def _write(frame, derivatives, L, scale, out, k):
     out.u[k] = frame[2]
     out.w[k] = derivatives[1, 0] * frame[0] + derivatives[1, 1] * frame[1]
     x, y = frame[2, 0], frame[2, 1]
-    level = max(np.sqrt(x * x + y * y), 1e-15)
-    east = np.array([-y / level, x / level, 0.0])
+    level, east = np.sqrt(x * x + y * y), np.zeros(3)
+    if level > 0.0:
+        east[0], east[1] = -y / level, x / level
+    else:  # at a pole, as in `east_north`
+        east[1] = np.copysign(1.0, x)
     north = np.cross(frame[2], east)
     turn = np.zeros((4, 4))
     for a in range(2):

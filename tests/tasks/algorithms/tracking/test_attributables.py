@@ -89,3 +89,14 @@ def test_near_the_pole_east_and_north_are_those_of_the_direction():
         np.array([[0, 3]]), np.array([0.0]), np.array([-1.0, 0.0, 1.0]), u, seen.cov[:3]
     )
     assert np.isfinite(found.cov).all()
+
+
+@pytest.mark.parametrize("off_rad", [0.0, 1e-17, 1e-6])
+def test_at_the_pole_errors_are_as_large_as_elsewhere(off_rad):
+    t = np.array([-1.0, 0.0, 1.0])
+    u = np.stack([1e-4 * t + off_rad, 0 * t, np.ones(3)], axis=1)
+    u /= np.linalg.norm(u, axis=1, keepdims=True)
+    found = attributables(
+        np.array([[0, 3]]), np.zeros(1), t, u, np.tile(1e-10 * np.eye(3), (3, 1, 1))
+    )
+    np.testing.assert_allclose(np.linalg.eigvalsh(found.cov[0, :2, :2]), 1e-10 / 3, rtol=0.01)
