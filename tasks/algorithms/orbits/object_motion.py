@@ -20,6 +20,8 @@ from epipole.tasks.algorithms.kernels import kernel
 # Least weight of a position in a velocity, over that of the best one of its object: the sums of
 # smaller ones would be lost in rounding.
 MIN_WEIGHT = 1e-5
+# Positions that are nearer in time are of one epoch: their slope is only rounding [s].
+MIN_APART_S = 2e-3
 
 
 def velocities(
@@ -61,8 +63,8 @@ def velocities(
         weight = np.ones(len(known)) if sigma_km is None else _weights(sigma_km[known])
         window = _Window(t, weight, time_s[lo:hi] - time_s[known[0]], half_s)
         slope, spread = _slopes(window, x, r_km[known[0]])
-        # Below 1e-6 s^2 all positions are of one epoch: the slope is only rounding.
-        several = spread > 1e-6
+        # Not by the spread: of a single poor position beside many good ones it is rounding.
+        several = (window.lasts_s() > MIN_APART_S) & (spread > 0.0)
         v_km_s[lo:hi] = np.where(several[:, None], slope, 0.0)
         spread_s[lo:hi] = np.where(several, np.sqrt(np.maximum(spread, 0.0)), 0.0)
     return v_km_s, spread_s
@@ -87,6 +89,11 @@ class _Window:
         weighted = (values.T * self.weight).T
         running = np.concatenate([np.zeros_like(weighted[:1]), np.cumsum(weighted, axis=0)])
         return np.asarray(running[self._last] - running[self._first])
+
+    def lasts_s(self) -> Array:
+        """Return the time from the first to the last position in each window; 0 without any."""
+        first, last = np.minimum(self._first, len(self.t) - 1), np.maximum(self._last - 1, 0)
+        return np.where(self._last > self._first, self.t[last] - self.t[first], 0.0)
 
 
 def _slopes(window: _Window, x: Array, origin_km: Array) -> tuple[Array, Array]:

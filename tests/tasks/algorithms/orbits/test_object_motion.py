@@ -52,6 +52,18 @@ def test_objects_do_not_mix_and_a_single_position_has_velocity_zero():
     np.testing.assert_allclose(spread_s, [0.5, 0.5, 0.0])
 
 
+def test_a_single_poor_position_after_many_good_ones_has_no_velocity():
+    """The sums over its window are differences of sums over all positions: they are rounding."""
+    for seed in range(20):
+        rng = np.random.default_rng(seed)
+        t = np.append(np.arange(1200.0) + rng.uniform(0, 0.1, 1200), 1300.0 + rng.uniform())
+        x = trajectory(LOW, t)[0][:, :3]
+        sigma_km = np.append(np.full(1200, 0.1), 50.0)
+        got, spread_s = velocities(np.array([0, 1201]), t, x, 30.0, sigma_km)
+        assert spread_s[-1] == 0.0
+        assert not got[-1].any()
+
+
 def test_nothing_in_gives_nothing_out():
     got, spread_s = velocities(np.array([0]), np.zeros(0), np.zeros((0, 3)), 5.0)
     assert got.shape == (0, 3)
