@@ -76,6 +76,10 @@ STAR_RATE_SIGMA = 4.0  # a run whose rate is smaller than this many sigmas stand
 # of a pixel let stars drift this fast. Objects in orbit move by arcseconds per second.
 STAR_DRIFT = 0.05 * ARCSEC
 STAR_RATE_KNOWN = 1.0 * ARCSEC  # rad/s: with a larger sigma, a run is not taken for a star
+# An object whose apparent motion turns back has a mean rate of zero too, but not in both halves of
+# its run. The limits are wider there: errors of the optics differ over the image. Shorter halves
+# show too little.
+HALF_RATE_SIGMA, HALF_DRIFT, MIN_HALF = 6.0, 4 * STAR_DRIFT, 10
 
 
 MOST_AT_STAR = 0.5  # share of a resting run's detections that must lie at one
@@ -84,8 +88,8 @@ MOST_AT_STAR = 0.5  # share of a resting run's detections that must lie at one
 class TrackRun(NamedTuple):
     """The sightings of one track, in order of time, and its motion.
 
-    It `rests` where its rate agrees with that of a star, and `stands_still` where besides the rate
-    is known well enough to exclude an object in orbit.
+    It `rests` where its rate agrees with that of a star, over all of it and in both halves. It
+    `stands_still` where besides the rate is known well enough to exclude an object in orbit.
     """
 
     members: Integers
@@ -130,8 +134,10 @@ def measure_runs(
     runs = []
     for lo, hi in itertools.pairwise(bounds):
         members = order[lo:hi]
-        rate, sigma = _mean_rate(t[lo:hi], u[lo:hi], variance[lo:hi], from_prior[lo:hi].any())
+        seen = t[lo:hi], u[lo:hi], variance[lo:hi]
+        rate, sigma = _mean_rate(*seen, from_prior[lo:hi].any())
         rests = rate < max(STAR_RATE_SIGMA * sigma, STAR_DRIFT)
+        rests = rests and _halves_rest(*seen, from_prior[lo:hi].any())
         still = rests and sigma < STAR_RATE_KNOWN
         residual = float(np.sqrt(np.mean(miss[lo:hi] ** 2) / 2)) / pixel_rad
         runs.append(TrackRun(members, rate, rests, still, residual))
@@ -152,6 +158,18 @@ def _mean_rate(time_s: Array, u: Array, variance: Array, from_prior: bool) -> tu
         miss = u - u.mean(axis=0) - t[:, None] * slope
         mean = max(mean, float(np.sum(miss**2)) / max(len(t) - 2, 1))
     return float(np.linalg.norm(slope)), float(np.sqrt(mean / lever))
+
+
+def _halves_rest(time_s: Array, u: Array, variance: Array, from_prior: bool) -> bool:
+    """Return whether both halves of a run rest too; arguments as in `_mean_rate`."""
+    middle = len(time_s) // 2
+    if middle < MIN_HALF:
+        return True
+    for part in (slice(None, middle), slice(middle, None)):
+        rate, sigma = _mean_rate(time_s[part], u[part], variance[part], from_prior)
+        if not rate < max(HALF_RATE_SIGMA * sigma, HALF_DRIFT):
+            return False
+    return True
 
 
 # Tracklets: runs of detections of one object in the frames of one sensor.

@@ -273,12 +273,16 @@ def still_sensor():
     )  # fmt: skip
 
 
-def kinds(rate_arcsec_s):
-    """Return the kinds of the detections of a point that moves at this rate for ten minutes."""
+def kinds(rate_arcsec_s, bend_arcsec_s2=0.0):
+    """Return the kinds of the detections of a point that moves for ten minutes.
+
+    At this rate, and with this acceleration, in the middle of which it turns back.
+    """
     rng = np.random.default_rng(1)
     off = 600.0 + rate_arcsec_s * np.arange(N) + rng.normal(0, 3.0, N)
+    off += bend_arcsec_s2 / 2 * (np.arange(N) - (N - 1) / 2) ** 2
     detections = filled(
-        DETECTIONS, N, **KEY, ra_deg=30 + rng.normal(0, 3.0, N) / 600.0 * 57.3,
+        DETECTIONS, N, **KEY, ra_deg=30 + rng.normal(0, 3.0, N) / off * 57.3,
         dec_deg=90.0 - off / 3600, sigma_arcsec=np.full(N, 3.0), kind=["unknown"] * N,
         x_px=500 + off / 21.1, y_px=np.full(N, 300.3) + rng.normal(0, 0.14, N),
     )  # fmt: skip
@@ -292,6 +296,11 @@ def kinds(rate_arcsec_s):
 )
 def test_a_slow_drift_is_a_stars_and_a_faster_one_an_objects(rate_arcsec_s, kind):
     assert kinds(rate_arcsec_s).count(kind) > 0.98 * N
+
+
+def test_an_object_whose_motion_turns_back_is_no_star():
+    """As a geostationary one does for a low sensor: its mean rate over the ten minutes is 0."""
+    assert kinds(0.0, 0.04).count("object") > 0.98 * N
 
 
 def crossing(time_s, source="stars"):
