@@ -19,6 +19,7 @@ from epipole.tasks.algorithms.orbits.object_motion import (
     neglected_motion,
     velocities,
 )
+from epipole.tasks.algorithms.orbits.platforms import views_from_one_position
 from epipole.tasks.common.grouping import group_offsets
 from epipole.tasks.common.sightings import only_id
 from epipole.tasks.solve.view_groups import ObjectViews, ViewGroups
@@ -60,10 +61,11 @@ def _solve(views: ObjectViews, reject_sigma: float) -> ViewGroups:
     epoch_ns, number = views.epoch_ns[start], views.object_number[start]
     group = np.repeat(np.arange(len(start)), np.diff(offsets))
     velocity = np.zeros((len(start), 3))
+    position_km = shared_position_sigmas(offsets, views)
     for step in range(3):
         limit = reject_sigma if step else np.inf
         x_km, cov_km2, chi2, used, mean_range = triangulate(
-            offsets, views.r_km, views.u, views.cov, views.sigma_km, velocity, limit
+            offsets, views.r_km, views.u, views.cov, position_km, velocity, limit
         )
         sigma = np.sqrt(traces(cov_km2) / 3)
         velocity, spread_s = _velocities(epoch_ns, number, x_km, sigma)
@@ -87,6 +89,14 @@ def _solve(views: ObjectViews, reject_sigma: float) -> ViewGroups:
         used=used,
         independent=np.zeros(len(start), bool),
     )
+
+
+def shared_position_sigmas(offsets: Indices, views: ObjectViews) -> Array:
+    """Return the 1-sigma errors of the sensors' positions [km] with which views of groups are
+    independent: the error that n sensors of one satellite share counts once if it has n times its
+    variance in each."""
+    sharing = views_from_one_position(offsets, views.r_km, views.sigma_km)
+    return views.sigma_km * np.sqrt(sharing)
 
 
 def with_neglected_motion(

@@ -26,6 +26,7 @@ from epipole.tasks.algorithms.orbits.orbit_fit import (
 )
 from epipole.tasks.algorithms.orbits.shared_errors import ArcEquations, scale_shared_errors
 from epipole.tasks.common.grouping import group_offsets
+from epipole.tasks.solve.positions import shared_position_sigmas
 from epipole.tasks.solve.view_groups import ViewGroups
 
 MIN_PROBABILITY = 1e-6  # of a chi-square: a state with a less probable one is rejected
@@ -115,7 +116,7 @@ def _arcs_of(groups: ViewGroups, settings: StateSettings) -> _NamedArcs:
         u=views.u,
         cov_noise=views.cov_noise,
         cov_bias=views.cov_bias,
-        sigma_km=views.sigma_km,
+        sigma_km=shared_position_sigmas(groups.offsets, groups.views)[rows],
     )
     object_id = groups.object_id[groups.group[rows[offsets[:-1]]]]
     return _NamedArcs(solved, arcs, sensor_ids[present], object_id, middle, n_epochs)

@@ -61,6 +61,36 @@ def platform_sizes(time_s: Array, sensor: Indices, r_km: Array, sigma_km: Array)
     return np.asarray(np.bincount(satellite)[satellite], np.int64)
 
 
+def views_from_one_position(offsets: Indices, r_km: Array, sigma_km: Array) -> Indices:
+    """Return how many views of its group are from the position of each, itself included: (n,).
+
+    Parameters
+    ----------
+    offsets : (g + 1,) int
+        Group k has the views ``offsets[k]:offsets[k + 1]``, all of one instant.
+    r_km : (n, 3) float
+        Reported positions of the sensors [km], in any one frame.
+    sigma_km : (n,) float
+        Their 1-sigma errors, per axis.
+
+    Notes
+    -----
+    Two sensors are on one satellite if they are nearer to each other than independent errors would
+    let them be, see `SAME_STATES`.
+    """
+    size = np.diff(offsets)
+    group = np.repeat(np.arange(len(size)), size)
+    count = np.ones(len(group), np.int64)
+    for step in range(1, int(size.max(initial=0))):
+        one = np.flatnonzero(group[step:] == group[:-step])
+        other = one + step
+        apart2 = np.sum((r_km[one] - r_km[other]) ** 2, axis=1)
+        same = apart2 < SAME_STATES * (sigma_km[one] ** 2 + sigma_km[other] ** 2)
+        count[one[same]] += 1
+        count[other[same]] += 1
+    return count
+
+
 def _on_its_path(
     time_s: Array, r_km: Array, mine: Indices, ends: Indices, near_km: Array
 ) -> Indices:

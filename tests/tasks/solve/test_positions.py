@@ -3,6 +3,7 @@
 import itertools
 
 import numpy as np
+import pytest
 from scenes.associations import filled
 
 from epipole.schemas.bridge import (
@@ -119,6 +120,43 @@ def tracked(rng, name, sensor, target, spread_arcsec, at, t):
         **unstack("{}_km", here[:, :3]), **unstack("sensor_v{}_km_s", here[:, 3:]),
         "position_sigma_km": np.full(len(at), 1e-4), "pixel_rad": np.full(len(at), 1e-4),
     })  # fmt: skip
+
+
+def from_one_satellite(seed, n_cameras, n=150):
+    """Views of n objects by cameras of one satellite, and by one of another satellite.
+
+    The error of a satellite's position is that of all its cameras. Also the true positions.
+    """
+    rng = np.random.default_rng(seed)
+    at, other = np.array([7000.0, 0.0, 0.0]), np.array([6800.0, 1500.0, 500.0])
+    true = np.array([7900.0, 800.0, 300.0]) + rng.normal(size=(n, 3)) * 50.0
+    position_km, direction_rad, tables = 0.5, 2e-5, []
+    shared = rng.normal(size=(n, 3)) * position_km
+    for k in range(n_cameras + 1):
+        r_km, error = (at, shared) if k else (other, rng.normal(size=(n, 3)) * position_km)
+        u = true - r_km
+        u /= np.linalg.norm(u, axis=1, keepdims=True)
+        noise = rng.normal(size=(n, 2)) * direction_rad
+        u += np.einsum("ni,nij->nj", noise, tangent_basis(u))
+        tables.append(filled(VIEWS, n, {
+            "epoch": np.full(n, T0), "sensor_id": [f"s{k}"] * n,
+            "tracklet_id": [f"s{k}-{m}" for m in range(n)],
+            "first_fitted": np.full(n, T0), "last_fitted": np.full(n, T0),
+            **unstack("u{}", u / np.linalg.norm(u, axis=1, keepdims=True)),
+            **unstack("{}_km", r_km + error),
+            **{f"cov_noise_{ab}_rad2": np.full(n, direction_rad**2) for ab in ("11", "22")},
+            "position_sigma_km": np.full(n, position_km), "pixel_rad": np.full(n, 1e-4),
+        }))  # fmt: skip
+    return concat(VIEWS, tables), np.tile(np.arange(n), n_cameras + 1), true
+
+
+@pytest.mark.parametrize("n_cameras", [1, 2, 4])
+def test_the_error_of_a_satellites_position_counts_once_for_all_its_cameras(n_cameras):
+    views, number, true = from_one_satellite(n_cameras, n_cameras)
+    groups = solved(views, number)
+    off = groups.x_km - true[groups.views.object_number[groups.offsets[:-1]]]
+    square = np.einsum("ni,nij,nj->n", off, np.linalg.inv(groups.cov_km2), off)
+    assert abs(square.mean() / 3 - 1) < 0.25  # four sigma of the mean
 
 
 def turning(seed, spread_arcsec):

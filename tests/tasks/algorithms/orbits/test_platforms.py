@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scenes.night_orbits import LOW, positions
 
-from epipole.tasks.algorithms.orbits.platforms import platform_sizes
+from epipole.tasks.algorithms.orbits.platforms import platform_sizes, views_from_one_position
 
 TURN_S = np.arange(0.0, 20.0)
 BEHIND_KM = 30.0  # a neighbour of the same plane
@@ -79,3 +79,11 @@ def test_single_positions_one_sensor_and_none():
     np.testing.assert_array_equal(sizes(*at_once), [1, 1])
     np.testing.assert_array_equal(sizes(*rows([LOW], (0,))), [1])
     assert sizes(np.zeros(0), np.zeros(0, np.int64), np.zeros((0, 3))).shape == (0,)
+
+
+def test_views_from_one_position_are_counted_in_their_group_alone():
+    at, other = np.array([7000.0, 0.0, 0.0]), np.array([0.0, 7000.0, 0.0])
+    r_km = np.array([at, other, at + 0.01, at, other, at + 1.0])
+    count = views_from_one_position(np.array([0, 3, 6]), r_km, np.full(6, SIGMA_KM))
+    np.testing.assert_array_equal(count, [2, 1, 2, 1, 1, 1])
+    assert not len(views_from_one_position(np.zeros(1, int), np.zeros((0, 3)), np.zeros(0)))
