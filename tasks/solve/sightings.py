@@ -477,8 +477,9 @@ def tabulate_attributables(sightings: SensorSightings | None, tracklets: pa.Tabl
     nearest = _nearest(time_ns, grouped.bounds, number, middle)
     ra, dec = radec_from_unit(fit.u)
     east, north = np.moveaxis(east_north(fit.u), 1, 0)
-    dt_s = (time_ns[nearest] - middle) / 1e9
-    r_km, v_km_s = states_near_frames(frames, grouped.frame[nearest], dt_s)
+    frame = grouped.frame[nearest]
+    dt_s = (frames.time_ns[frame] - middle) / 1e9  # a row may be exposed at another time
+    r_km, v_km_s = states_near_frames(frames, frame, dt_s)
     columns = {
         "ra_deg": np.degrees(ra),
         "dec_deg": np.degrees(dec),
@@ -488,7 +489,7 @@ def tabulate_attributables(sightings: SensorSightings | None, tracklets: pa.Tabl
         "bias_sigma_arcsec": _bias_sigma(sightings, nearest) / ARCSEC,
         **unstack("{}_km", r_km),
         **unstack("v{}_km_s", v_km_s),
-        "position_sigma_km": frames.position_sigma_km[grouped.frame[nearest]],
+        "position_sigma_km": frames.position_sigma_km[frame],
         **_mean_magnitudes(sightings, number),
     }
     return table(

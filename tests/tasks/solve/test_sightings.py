@@ -41,7 +41,7 @@ def sighted(source="stars", *, tracklet="t", flux=np.nan, cov_optics=None, **cha
     return tabulate_sightings(sighting(source, tracklet, flux, cov_optics, **changed))
 
 
-def sighting(source="stars", tracklet="t", flux=np.nan, cov_optics=None, **changed):
+def sighting(source="stars", tracklet="t", flux=np.nan, cov_optics=None, camera=CAMERA, **changed):
     u_sensor = unproject(CAMERA, *(np.full(N, p) for p in PLACE_PX))
     ra, dec = radec_from_unit(ATTITUDE.inv().apply(u_sensor))
     key = {
@@ -60,8 +60,9 @@ def sighting(source="stars", tracklet="t", flux=np.nan, cov_optics=None, **chang
         "centroid": np.zeros(N, np.int32), "ra_deg": np.degrees(ra), "dec_deg": np.degrees(dec),
         "sigma_arcsec": np.full(N, CENTROID), "kind": ["object"] * N,
         "tracklet_id": [tracklet] * N, "track_id": [tracklet] * N, "flux": np.full(N, flux),
+        "x_px": np.full(N, PLACE_PX[0]), "y_px": np.full(N, PLACE_PX[1]),
     })  # fmt: skip
-    cameras = cameras_of({"s": CAMERA}, cov_optics)
+    cameras = cameras_of({"s": camera}, cov_optics)
     return sight_objects(solutions, detections, cameras, TrackletSettings(), HALF_WIDTH_S)
 
 
@@ -248,3 +249,15 @@ def test_a_satellite_stays_on_its_orbit_far_from_its_frames(dt_s):
     true = trajectory(low, np.array([-dt_s]))[0][0]
     np.testing.assert_allclose(r_km[0], true[:3], atol=1e-3)
     np.testing.assert_allclose(v_km_s[0], true[3:], atol=1e-4)
+
+
+def test_an_attributable_has_the_sensors_state_of_its_epoch_with_a_rolling_shutter_too():
+    """The row of the object is exposed long before the frame, and the sensor moves on."""
+    lines = CAMERA._replace(line_time_s=1e-3)
+    way = unstack("{}_km", np.array([7000.0, 0.0, 0.0]) + np.arange(N)[:, None] * V_KM_S)
+    rolling, whole = (
+        attributable(camera=camera, **way).to_pylist()[0] for camera in (lines, CAMERA)
+    )
+    assert rolling["epoch"] == whole["epoch"]
+    for name in ("x_km", "y_km", "z_km"):
+        assert rolling[name] == pytest.approx(whole[name], abs=5e-3)
