@@ -24,7 +24,8 @@ from typing import NamedTuple
 import numpy as np
 
 from epipole.schemas.arrays import Array, Flags, Indices
-from epipole.tasks.algorithms.constants import ARCSEC, GM_KM3_S2
+from epipole.tasks.algorithms.constants import ARCSEC
+from epipole.tasks.algorithms.earth_gravity import gravity
 from epipole.tasks.algorithms.geometry.directions import skew, tangent_basis
 
 PRIOR_S = 10.0  # 1-sigma prior of a wrong clock's offset
@@ -468,12 +469,8 @@ def shift_lines(lines: Lines, offset_s: Array) -> Lines:
     """
     d = np.append(offset_s, 0.0)[lines.sensor][:, None]
     moved = (lines.v_km_s - lines.v_sensor_km_s) * d
-    fall = (_gravity(lines.r_km) - _gravity(lines.x_km)) * d * d / 2
+    fall = (gravity(lines.r_km) - gravity(lines.x_km)) * d * d / 2
     return lines._replace(r_km=lines.r_km + moved + fall)
-
-
-def _gravity(r_km: Array) -> Array:
-    return -GM_KM3_S2 * r_km / np.linalg.norm(r_km, axis=1, keepdims=True) ** 3
 
 
 def _equations(lines: Lines, kept: Flags, prior_sigma: Array) -> tuple[Array, Array]:

@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 from scenes.late_sensors import POSITION_KM, lines_of
 
-from epipole.tasks.algorithms.constants import ARCSEC
+from epipole.tasks.algorithms.constants import ARCSEC, GM_KM3_S2
+from epipole.tasks.algorithms.orbits.orbit_fit import trajectory
 from epipole.tasks.algorithms.sensor_faults.fault_judgement import (
     CLOCK,
     EPHEMERIS,
@@ -122,3 +123,54 @@ def test_it_is_undecided_which_half_is_wrong():
     assert found.doubt.spread_log_odds > 6.0
     # Two of four are off by 0.3 km per axis; what all share does not show.
     assert 0.05 < found.doubt.spread_km < 0.3
+
+
+TURN_RAD_S = 7.292115e-5  # of the Earth
+
+
+def on_the_ground(latitude, longitude, t):
+    """Positions and velocities of a site, in axes that do not turn."""
+    angle = longitude + TURN_RAD_S * t
+    r = 6371.0 * np.stack([
+        np.cos(latitude) * np.cos(angle), np.cos(latitude) * np.sin(angle),
+        np.full_like(t, np.sin(latitude)),
+    ], axis=1)  # fmt: skip
+    return r, TURN_RAD_S * np.cross([0.0, 0.0, 1.0], r)
+
+
+def lines_from_the_ground(seed, offset_s, sigma_rad=ARCSEC):
+    """Lines of sight from four sites to ten low objects; the clock of site 2 is off."""
+    rng = np.random.default_rng(seed)
+    t, parts = np.arange(0.0, 60.0, 6.0), []
+    sites = [(0.6, 0.0), (0.75, 0.12), (0.5, 0.2), (0.65, 0.3)]
+    over = np.array([np.cos(0.62) * np.cos(0.15), np.cos(0.62) * np.sin(0.15), np.sin(0.62)])
+    for number in range(10):
+        side = np.cross(over, rng.normal(size=3))
+        radius = rng.uniform(7078.0, 7878.0)
+        speed = np.sqrt(GM_KM3_S2 / radius)
+        state = np.concatenate([radius * over, speed * side / np.linalg.norm(side)])
+        at = trajectory(state, t)[0]
+        for sensor, site in enumerate(sites):
+            late = offset_s if sensor == 2 else 0.0
+            u = trajectory(state, t - late)[0][:, :3] - on_the_ground(*site, t - late)[0]
+            u /= np.linalg.norm(u, axis=1, keepdims=True)
+            u += rng.normal(size=u.shape) * sigma_rad
+            u /= np.linalg.norm(u, axis=1, keepdims=True)
+            group = number * len(t) + np.arange(len(t))
+            cov = np.tile(sigma_rad**2 * np.eye(2), (len(t), 1, 1))
+            which = np.full(len(t), sensor)
+            stated = on_the_ground(*site, t)
+            parts.append((group, which, u, cov, at[:, :3], at[:, 3:], *stated))
+    columns = [np.concatenate(column) for column in zip(*parts, strict=True)]
+    order = np.lexsort((columns[1], columns[0]))
+    return Lines(*(column[order] for column in columns))
+
+
+@pytest.mark.parametrize("offset_s", [1.0, 3.0, 4.5])
+def test_sensors_on_the_ground_do_not_fall(offset_s):
+    for seed in range(3):
+        lines = lines_from_the_ground(seed, offset_s)
+        guess_s = np.array([0.0, 0.0, offset_s, 0.0])
+        found = judge_sensors(lines, np.full(4, 1e-3), np.zeros(4), guess_s)
+        assert list(found.cause) == [SOUND, SOUND, CLOCK, SOUND]
+        assert abs(found.offset_s[2] - offset_s) < 4 * found.sigma_s[2]
