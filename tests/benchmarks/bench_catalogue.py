@@ -39,6 +39,7 @@ CAMERAS = (
     ("hipparcos", 2.0, 512, 20),
     ("deep", 2.0, 512, 50),
 )
+MADE = {"hipparcos": read_hipparcos, "deep": build_deep_catalogue}
 NOISE = {
     "0.15 px, 2 false, 5 % missing": {"sigma_px": 0.15, "false_points": 2.0, "star_drop": 0.05},
     "0.5 px, 10 false, 20 % missing": {"sigma_px": 0.5, "false_points": 10.0, "star_drop": 0.2},
@@ -52,14 +53,14 @@ def cpu_ms(work: Callable[[], Any]) -> float:
     return 1e3 * (time.process_time() - started)
 
 
-def bench_build(folder: Path, repeats: int) -> None:
-    made = {"hipparcos": read_hipparcos, "deep": build_deep_catalogue}
+def bench_build(folder: Path, repeats: int, only: list[str]) -> None:
+    made = {name: make for name, make in MADE.items() if name in only}
     tables = {}
     for name, make in made.items():
         took = [cpu_ms(lambda: tables.update({name: make()})) for _ in range(repeats)]  # noqa: B023
         print(f"{name}: {tables[name].num_rows} stars, table made in {np.median(took):.0f} ms")
     print("| catalogue, field | stars, pairs | made: stars, grid, pairs ms | from disk ms |")
-    for name, field, pixels, centroids in CAMERAS:
+    for name, field, pixels, centroids in (camera for camera in CAMERAS if camera[0] in made):
         catalogue, costs = Catalogue(tables[name]), []
         for disk in ("off", str(folder / "cache")):
             os.environ["EPIPOLE_CACHE"] = disk
@@ -146,10 +147,11 @@ def main() -> None:
     parser.add_argument("parts", nargs="*", default=["build", "narrow"])
     parser.add_argument("--seeds", type=int, nargs="+", default=[1, 2, 3])
     parser.add_argument("--repeats", type=int, default=5, help="of build")
+    parser.add_argument("--only", nargs="+", choices=MADE, default=list(MADE), help="of build")
     arguments = parser.parse_args()
     with tempfile.TemporaryDirectory() as folder:
         if "build" in arguments.parts:
-            bench_build(Path(folder), arguments.repeats)
+            bench_build(Path(folder), arguments.repeats, arguments.only)
         if "narrow" in arguments.parts:
             bench_narrow(Path(folder), arguments.seeds)
 

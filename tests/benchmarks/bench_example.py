@@ -1,9 +1,10 @@
 """Whole runs of the example, and the commands that look at its dataset: wall and CPU seconds.
 
-    python tests/benchmarks/bench_example.py [--rounds 3] [--cached]
+    python tests/benchmarks/bench_example.py [--rounds 3] [--cached] [--only TEXT]
 
 Each is a process of its own. The first run has an empty cache: it copies the kernels of a wheel,
-else it compiles. With --cached it is left out. CPU is that of the process and all that it starts.
+else it compiles. With --cached it is left out, with --only also the commands whose names do not
+contain a text. CPU is that of the process and all that it starts.
 """
 
 import argparse
@@ -40,6 +41,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--rounds", type=int, default=3)
     parser.add_argument("--cached", action="store_true", help="without the first run")
+    parser.add_argument("--only", default="", help="commands whose names contain this")
     chosen = parser.parse_args()
     print("| what | wall s | CPU s |\n|---|---|---|")
     with tempfile.TemporaryDirectory() as folder:
@@ -60,6 +62,8 @@ def main() -> None:
             "`epipole overlay`": ("overlay", out, EXAMPLE, "--out", work / "night.mcap"),
         }
         for name, command in cases.items():
+            if chosen.only not in name:
+                continue
             row(name, [measure(*command) for _ in range(chosen.rounds)])
 
 
