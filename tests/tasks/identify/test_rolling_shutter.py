@@ -12,7 +12,12 @@ from epipole.schemas.bridge import array, stack, stack_covariance
 from epipole.schemas.scene import validate_scene
 from epipole.schemas.settings import Assumption
 from epipole.tasks.algorithms.constants import ARCSEC
-from epipole.tasks.algorithms.geometry.turning import angular_rates, turned
+from epipole.tasks.algorithms.geometry.turning import (
+    ANY_RATE,
+    angular_rates,
+    rates_within_frames,
+    turned,
+)
 from epipole.tasks.read.assume_readings import as_assumed
 
 LINE_S = 1e-4  # an image of 1024 rows takes a tenth of a second
@@ -128,6 +133,53 @@ def test_a_jump_is_no_rate():
     R = attitudes(t_s)
     R[3:] = R[3:] @ Rotation.from_rotvec([0.3, 0.0, 0.0]).as_matrix()
     assert np.allclose(angular_rates(t_s, R, np.ones(6, bool)), RATE, atol=1e-9)
+
+
+def slow_log(folder, rate_deg_s, rate_hz=0.05, duration_s=301.0):
+    """Write a log of a sensor that turns and has a frame in 20 s, or one only."""
+    defaults = {"detection": {"sigma_px": 0.15, "false_points": 3.0, "star_drop": 0.05}}
+    spin = SENSORS[0]["pointing"] | {"rate_deg_s": rate_deg_s}
+    sensor = SENSORS[0] | {"pointing": spin, "rate_hz": rate_hz, "magnitude_limit": 7.0}
+    scene = {"name": "slow", "start": "2026-03-01T02:00:00Z", "duration_s": duration_s, "seed": 5,
+             "sensor_defaults": defaults, "sensors": [sensor]}  # fmt: skip
+    simulate(validate_scene(scene, "test"), folder / "slow.mcap")
+    return folder / "slow.mcap"
+
+
+@pytest.mark.parametrize("rate_deg_s", [0.0, 0.2, 1.0, 3.0])
+def test_where_frames_are_far_apart_their_stars_tell_the_rate(rate_deg_s, tmp_path):
+    log = slow_log(tmp_path, rate_deg_s)
+    found, _ = made_of(log, "spins")
+    frames = true_frames(log, "spins")
+    assert array(found.solutions, "attitude_source").tolist() == ["stars"] * len(frames)
+    assert 1.6 < turns(found.solutions, frames).mean() < 4.8  # of 16 frames: 3 +- 0.6
+
+
+def test_the_stars_of_a_single_frame_tell_its_rate(tmp_path):
+    log = slow_log(tmp_path, 1.0, rate_hz=1.0, duration_s=0.9)
+    found, _ = made_of(log, "spins")
+    assert array(found.solutions, "attitude_source").tolist() == ["stars"]
+    assert turns(found.solutions, true_frames(log, "spins"))[0] < 16.3  # 0.1 % of the right ones
+
+
+def test_turns_and_rates_of_frames_have_honest_errors():
+    rng, n, per, sigma = np.random.default_rng(4), 1000, 6, 1e-4
+    frame = np.repeat(np.arange(n), per)
+    x, y = rng.uniform(-0.1, 0.1, (2, n * per))
+    u = np.stack([x, y, np.ones_like(x)], axis=1)
+    u /= np.linalg.norm(u, axis=1, keepdims=True)
+    late_s = 0.5 * y + 0.02  # the middle row is exposed later than the frame's time
+    turn, rate = rng.normal(0, 1e-4, (n, 3)), rng.normal(0, ANY_RATE, (n, 3))
+    noise = rng.normal(0, sigma, (n * per, 3))
+    off = np.cross(turn[frame] + rate[frame] * late_s[:, None], u)
+    off += noise - np.sum(noise * u, axis=1, keepdims=True) * u
+    found = rates_within_frames(frame, u, off, late_s, np.full(n * per, sigma), n + 1)
+    error = found.turn_rad[:n] - turn
+    square = np.einsum("ni,nij,nj->n", error, np.linalg.inv(found.cov_rad2[:n]), error)
+    assert 2.8 < square.mean() < 3.2
+    alone = np.einsum("ni,nij,nj->n", error, np.linalg.inv(found.cov_alone[:n]), error)
+    assert alone.mean() > 2 * square.mean()
+    assert not any(np.any(values[n]) for values in found)  # without stars
 
 
 @pytest.mark.parametrize("t_s", [[0.0], [0.0, 60.0]])
