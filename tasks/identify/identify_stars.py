@@ -34,6 +34,7 @@ from epipole.tasks.identify.tabulate import (
     StarAttitudes,
     barycentric_velocity,
     detections_table,
+    matched_stars,
     rejects_table,
     solutions_table,
     stars_table,
@@ -81,7 +82,7 @@ def identify_stars(
         lambda c: _identify(exposures, frame_states, c, catalogue, sensors, identification),
     )  # fmt: skip
     attitudes = _attitudes(frame_states, found, sensors)
-    matches = _matches(found, rows, centroids)
+    matches = matched_stars(found, rows, centroids)
     attitudes = _with_optics(attitudes, centroids, matches, cameras)
     attitudes = _with_unknown_velocity(attitudes, frame_states)
     stars = stars_table(exposures, frame_states, centroids, attitudes, matches)
@@ -229,19 +230,3 @@ def _with_unknown_velocity(a: StarAttitudes, frame_states: pa.Table) -> StarAtti
     sigma_arcsec = LOW_ORBIT_KM_S / np.sqrt(3) / SPEED_OF_LIGHT_KM_S / ARCSEC  # per axis
     across = np.diag([1.0, 1.0, 0.0]) * sigma_arcsec**2
     return a._replace(shared_arcsec2=a.shared_arcsec2 + unknown[:, None, None] * across)
-
-
-def _matches(found: IdentifiedSensor | None, rows: Integers, c: FlatCentroids) -> MatchedStars:
-    """Return the stars of the centroids; `rows` took part, in this order."""
-    if found is None:
-        none, frames = np.empty(0, np.int64), len(c.first) - 1
-        return MatchedStars(none, none, np.empty(0), np.empty((0, 3)), np.ones(frames))
-    star = np.full(len(c.x_px), -1)
-    star[rows] = found.solutions.star
-    at = np.flatnonzero(star >= 0)
-    star = star[at]
-    stars = found.sky.catalogue
-    return MatchedStars(
-        at, stars.star_id[star], stars.magnitude[star], stars.u_icrs[star], found.sigma_scale,
-        found.sigma_floor_px,
-    )  # fmt: skip

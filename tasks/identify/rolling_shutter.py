@@ -14,7 +14,7 @@ import pyarrow as pa
 from epipole.schemas.arrays import Array, Flags, Integers
 from epipole.schemas.bridge import array, stack
 from epipole.tasks.algorithms.geometry.covariances import traces
-from epipole.tasks.algorithms.geometry.directions import aberrate, matrix_from_quaternion
+from epipole.tasks.algorithms.geometry.directions import matrix_from_quaternion
 from epipole.tasks.algorithms.geometry.turning import (
     FrameRates,
     angular_rates,
@@ -23,7 +23,12 @@ from epipole.tasks.algorithms.geometry.turning import (
 )
 from epipole.tasks.algorithms.star_identification.sensor import IdentifiedSensor
 from epipole.tasks.identify.frame_inputs import FlatCentroids
-from epipole.tasks.identify.tabulate import barycentric_velocity, used_sigma_px
+from epipole.tasks.identify.tabulate import (
+    barycentric_velocity,
+    matched_stars,
+    predicted_stars,
+    used_sigma_px,
+)
 
 # 1-sigma of the unknown rate of a sensor [rad/s], tried in this order until this share of its
 # frames is identified; before them the rate of the prior attitudes, or rest.
@@ -111,13 +116,10 @@ def _rates_of_stars(
     """
     sensor, rows = found
     assert sensor is not None
-    star, R = sensor.solutions.star, sensor.solutions.R_sensor_from_icrs
-    at, star = rows[star >= 0], star[star >= 0]
-    frame = c.frame[at]
-    u = np.einsum(
-        "nij,nj->ni", R[frame], aberrate(sensor.sky.catalogue.u_icrs[star], v_km_s[frame])
-    )
-    sigma_px = used_sigma_px(stated, at, sensor.sigma_floor_px) * sensor.sigma_scale[frame]
+    stars, R = matched_stars(sensor, rows, c), sensor.solutions.R_sensor_from_icrs
+    at, frame = stars.at, c.frame[stars.at]
+    u = predicted_stars(R, stars, frame, v_km_s)
+    sigma_px = used_sigma_px(stated, at, stars.floor_px) * stars.scale[frame]
     return rates_within_frames(
         frame, u, c.u[at] - u, c.row_s[at], sigma_px * c.pixel_rad[at], len(R)
     )

@@ -33,6 +33,7 @@ from epipole.tasks.algorithms.geometry.directions import (
 )
 from epipole.tasks.algorithms.geometry.turning import turned
 from epipole.tasks.algorithms.photometry import flux_scale
+from epipole.tasks.algorithms.star_identification.sensor import IdentifiedSensor
 from epipole.tasks.algorithms.times import earth_velocity
 from epipole.tasks.identify.frame_inputs import FlatCentroids
 
@@ -137,7 +138,7 @@ def stars_table(
     """Return STARS: a row per identified star."""
     frame = c.frame[m.at]
     v_km_s = barycentric_velocity(array(exposures, "time"), frame_states)
-    u = np.einsum("nij,nj->ni", attitudes.R[frame], aberrate(m.u_icrs, v_km_s[frame]))
+    u = predicted_stars(attitudes.R, m, frame, v_km_s)
     if c.row_s.any():
         u = turned(u, c.turn[m.at])
     dx, dy = np.full((2, len(frame)), np.nan)
@@ -158,6 +159,37 @@ def stars_table(
             "dy_px": np.round(dy * RESIDUAL_STEPS) / RESIDUAL_STEPS,
         },
     )
+
+
+def matched_stars(found: IdentifiedSensor | None, rows: Integers, c: FlatCentroids) -> MatchedStars:
+    """Return the stars of the centroids; `rows` took part, in this order."""
+    if found is None:
+        none, frames = np.empty(0, np.int64), len(c.first) - 1
+        return MatchedStars(none, none, np.empty(0), np.empty((0, 3)), np.ones(frames))
+    star = np.full(len(c.x_px), -1)
+    star[rows] = found.solutions.star
+    at = np.flatnonzero(star >= 0)
+    star = star[at]
+    stars = found.sky.catalogue
+    return MatchedStars(
+        at, stars.star_id[star], stars.magnitude[star], stars.u_icrs[star], found.sigma_scale,
+        found.sigma_floor_px,
+    )  # fmt: skip
+
+
+def predicted_stars(R: Array, m: MatchedStars, frame: Integers, v_km_s: Array) -> Array:
+    """Return the directions (n, 3) of stars in sensor axes, at the times of their frames.
+
+    Parameters
+    ----------
+    R : (F, 3, 3) float
+        Attitudes, sensor from ICRS.
+    frame : (n,) int
+        Frame of each star.
+    v_km_s : (F, 3) float
+        Velocities of the sensor, by which stars are aberrated.
+    """
+    return np.einsum("nij,nj->ni", R[frame], aberrate(m.u_icrs, v_km_s[frame]))
 
 
 def used_sigma_px(c: FlatCentroids, at: Integers, floor_px: float) -> Array:
