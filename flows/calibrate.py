@@ -4,7 +4,6 @@ import json
 import math
 from typing import Any
 
-import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 
@@ -24,6 +23,7 @@ from epipole.tasks.calibrate.calibrate_unknown import (
     CameraReport,
     calibrate_unknown,
 )
+from epipole.tasks.common.sightings import calibration_at
 from epipole.tasks.read.order_frames import (
     OrderedFrames,
     frame_times,
@@ -80,8 +80,8 @@ def _of_sensor(
 ) -> CameraReport:
     time_ns = frame_times(frames.folder, number)
     cameras = frames.cameras.filter(pc.field("sensor_id") == frames.sensors[number])
-    newest = int(np.searchsorted(array(cameras, "time"), time_ns[-1], side="right")) - 1
-    if newest > 0:  # the first one also holds before its time
+    newest = int(calibration_at(array(cameras, "time"), time_ns[-1:])[0])
+    if newest > 0:
         cameras = cameras.slice(newest, 1)
         time_ns = time_ns[time_ns >= array(cameras, "time")[0]]
     rows = evenly_spaced(len(time_ns), MAX_FRAMES)

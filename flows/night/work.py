@@ -17,6 +17,7 @@ from epipole.schemas.tables import REJECTS
 from epipole.tasks.calibrate.calibrate_sensors import SensorStars
 from epipole.tasks.check.check_sensors import SensorVerdict
 from epipole.tasks.common.batches import Batch, in_batches
+from epipole.tasks.common.sightings import calibration_at
 from epipole.tasks.identify.identify_span import SpanToIdentify
 from epipole.tasks.read.order_frames import OrderedFrames, SpanFrames, states_between
 from epipole.tasks.track.join_tracklets import SensorToJoin
@@ -126,11 +127,10 @@ def cameras_of_night(frames: OrderedFrames, night: str) -> pa.Table:
         wanted = [each for each in found if _is_wanted(each.span, day)]
         rows = np.flatnonzero(sensor == sensor_id)
         if wanted and len(rows):
-            between_ns = [wanted[0].first_ns, wanted[-1].last_ns]
-            first, end = np.searchsorted(time_ns[rows], between_ns, side="right").tolist()
+            between_ns = np.array([wanted[0].first_ns, wanted[-1].last_ns])
+            first, last = calibration_at(time_ns[rows], between_ns).tolist()
             holds[rows] = False
-            # The first one also counts before its time.
-            holds[rows[max(first - 1, 0) : max(end, 1)]] = True
+            holds[rows[first : last + 1]] = True
     return cameras.filter(pa.array(holds))
 
 

@@ -12,7 +12,7 @@ import numpy as np
 import pyarrow as pa
 
 from epipole.io.work.parts import Parts
-from epipole.schemas.arrays import Array, Integers
+from epipole.schemas.arrays import Array, Indices, Integers
 from epipole.schemas.bridge import (
     array,
     concat,
@@ -41,7 +41,7 @@ from epipole.tasks.algorithms.geometry.optics_calibration import (
     calibrate_optics,
 )
 from epipole.tasks.common.batches import Batch
-from epipole.tasks.common.sightings import camera_of, optics_covariance_of
+from epipole.tasks.common.sightings import calibration_at, camera_of, optics_covariance_of
 from epipole.tasks.common.stage_tasks import stage_task
 
 LOGGER = logging.getLogger(__name__)
@@ -139,19 +139,17 @@ def calibrate_sensors(
     """
     rows, changed, departed = [], dict[int, dict[str, Any]](), set[str]()
     for name in dict.fromkeys(cameras["sensor_id"].to_pylist()):
-        fits = []
-        for of_sensor in _calibrations(cameras, nominal, name):
-            images = _images(of_sensor.choose(rows_with(stars, "sensor_id", name)),
-                             of_sensor.present.camera)  # fmt: skip
-            given = NominalOptics(of_sensor.logged, principal_point_px)
-            fitted = _fit(given, of_sensor.present, images)
+        fits, stars_of_sensor = [], rows_with(stars, "sensor_id", name)
+        for one in _calibrations(cameras, nominal, name):
+            images = _images(one.choose(stars_of_sensor), one.present.camera)
+            fitted = _fit(NominalOptics(one.logged, principal_point_px), one.present, images)
             if fitted is None:
                 continue
             fit, departs = fitted
             fits.append(fit)
             if departs:
                 values = fit.camera._asdict() | _covariance_columns(fit.cov)
-                changed |= dict.fromkeys(of_sensor.rows, values)
+                changed |= dict.fromkeys(one.rows, values)
                 departed.add(name)
             LOGGER.debug(
                 "%s: optics from %d stars, rms %.3f px", name, fit.n_stars, fit.residual_px
@@ -182,33 +180,32 @@ class _Calibration(NamedTuple):
     rows : its rows in CAMERAS, several where it holds again after another one
     logged : the camera of the log
     present : the camera with which the stars were identified
-    newest : (calibrations, 2) the time from which each of the sensor holds [ns], and its row
+    all_rows, begins_ns : rows of all calibrations of the sensor, and from when they hold [ns]
     """
 
     rows: list[int]
     logged: Camera
     present: _Present
-    newest: Integers
+    all_rows: Indices
+    begins_ns: Integers
 
     def choose(self, stars: pa.Table) -> pa.Table:
         """Return the stars of the sensor that were identified with this calibration."""
-        if len(self.rows) == len(self.newest):
+        if len(self.rows) == len(self.all_rows):
             return stars
-        time_ns, row = self.newest.T
-        at = np.searchsorted(time_ns, array(stars, "time"), side="right") - 1
-        # The first one also holds before its time.
-        return stars.filter(pa.array(np.isin(row[np.maximum(at, 0)], self.rows)))
+        row = self.all_rows[calibration_at(self.begins_ns, array(stars, "time"))]
+        return stars.filter(pa.array(np.isin(row, self.rows)))
 
 
 def _calibrations(cameras: pa.Table, nominal: pa.Table, sensor_id: str) -> list[_Calibration]:
     """Return the calibrations of a sensor that differ."""
-    rows = np.flatnonzero(np.asarray(cameras["sensor_id"]) == sensor_id).tolist()
-    newest = np.column_stack([array(cameras, "time")[rows], rows])
+    rows = np.flatnonzero(np.asarray(cameras["sensor_id"]) == sensor_id)
+    begins_ns = array(cameras, "time")[rows]
     found: dict[tuple[Any, ...], _Calibration] = {}
-    for k in rows:
+    for k in rows.tolist():
         present, logged = camera_of(cameras, k), camera_of(nominal, k)
         cov, logged_cov = (optics_covariance_of(t, k).tobytes() for t in (cameras, nominal))
-        one = _Calibration([], logged, _Present(present, cov != logged_cov), newest)
+        one = _Calibration([], logged, _Present(present, cov != logged_cov), rows, begins_ns)
         found.setdefault((present, logged, cov, logged_cov), one).rows.append(k)
     return list(found.values())
 

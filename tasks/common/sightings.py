@@ -186,6 +186,15 @@ def cameras_of(cameras: pa.Table, sensor_id: str) -> pa.Table:
     return rows_with(cameras, "sensor_id", sensor_id)
 
 
+def calibration_at(begins_ns: Integers, time_ns: Integers) -> Indices:
+    """Return the calibration (n,) of a sensor that holds at each time (n,).
+
+    It is the newest one; the first one also holds before its time. `begins_ns` (k,) are the times
+    of its calibrations, ascending.
+    """
+    return np.maximum(np.searchsorted(begins_ns, time_ns, side="right") - 1, 0)
+
+
 def camera_of(cameras: pa.Table, row: int) -> Camera:
     """Return the camera in a row of `cameras`."""
     # Not the time: a Python datetime has no nanoseconds.

@@ -30,6 +30,7 @@ from epipole.tasks.algorithms.orbits.state_interpolation import (
     interpolate_states,
 )
 from epipole.tasks.algorithms.star_identification.centroids import filled_sigmas
+from epipole.tasks.common.sightings import calibration_at
 
 LOGGER = logging.getLogger(__name__)
 
@@ -125,8 +126,7 @@ def _cameras_of(exposures: pa.Table, cameras: pa.Table) -> tuple[Integers, dict[
         return np.full(exposures.num_rows, -1), {}
     times = array(cameras, "time")[rows]
     rows = rows[np.argsort(times, kind="stable")]
-    newest = np.searchsorted(np.sort(times), array(exposures, "time"), side="right") - 1
-    holds = rows[np.maximum(newest, 0)]
+    holds = rows[calibration_at(np.sort(times), array(exposures, "time"))]
     used = np.unique(holds)
     values = [cameras.select(list(Camera._fields)).slice(int(r), 1).to_pylist()[0] for r in used]
     return holds, {int(r): Camera(**v) for r, v in zip(used, values, strict=True)}
