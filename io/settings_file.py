@@ -2,12 +2,13 @@
 
 import json
 import textwrap
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 from epipole.io.paths import known_as, open_remote, refuse_device
 from epipole.schemas.errors import LogError, SettingsError
-from epipole.schemas.given_settings import parse_settings, validate_settings
+from epipole.schemas.given_settings import parse_settings, validate_settings, with_assumptions
 from epipole.schemas.settings import Group, Settings
 
 WIDTH = 88
@@ -33,6 +34,17 @@ def read_settings(path: Path) -> Settings:
             f"{path}: {error.strerror}; `epipole settings` prints a file to start from"
         ) from error
     return parse_settings(text, str(path))
+
+
+def run_settings(path: Path | None, assume: Sequence[str]) -> Settings:
+    """Return the settings of a run: those of a TOML file, or the defaults, with assumptions.
+
+    Raises
+    ------
+    SettingsError
+        As `read_settings` and `with_assumptions`.
+    """
+    return with_assumptions(read_settings(path) if path else Settings(), assume)
 
 
 def merged_settings(file: str | None, given: Settings) -> Settings:

@@ -54,14 +54,11 @@ def nights(
     from epipole.io.catalogues.element_sets import read_known_objects
     from epipole.io.catalogues.star_catalogue import check_star_catalogue
     from epipole.io.datasets.dataset import require_dataset
-    from epipole.io.settings_file import read_settings
+    from epipole.io.settings_file import run_settings
     from epipole.io.work.folder import clear_unfinished, unfinished_work
-    from epipole.schemas.given_settings import with_assumptions
-    from epipole.schemas.settings import Settings
 
     require_dataset(dataset)
-    written = read_settings(settings) if settings else Settings()
-    today = with_assumptions(written, assume or ())
+    today = run_settings(settings, assume or ())
     check_star_catalogue(today.identification.catalogue)
     known_key = read_known_objects(known).sha256 if known else None
     published = {n.date: n for n in published_nights(dataset, today, known_key)}

@@ -34,12 +34,10 @@ from epipole.io.datasets.dataset import (
 )
 from epipole.io.logs.listing import list_logs
 from epipole.io.paths import line_of
-from epipole.io.settings_file import read_settings
+from epipole.io.settings_file import run_settings
 from epipole.schemas.errors import EpipoleError, NoFramesError
-from epipole.schemas.given_settings import with_assumptions
 from epipole.schemas.options import Runner
 from epipole.schemas.run_record import RunState
-from epipole.schemas.settings import Settings
 
 LOGGER = logging.getLogger(__name__)
 
@@ -111,8 +109,7 @@ class Nights:
             Where one of them cannot be used.
         """
         self._logs, self._out, self._options, self._early = logs, out, options, early
-        written = read_settings(options.settings) if options.settings else Settings()
-        self._settings = with_assumptions(written, options.assume)
+        self._settings = run_settings(options.settings, options.assume)
         check_folder(out)
         check_star_catalogue(self._settings.identification.catalogue)
         known = read_known_objects(options.known) if options.known is not None else None
