@@ -74,18 +74,28 @@ def test_a_range_of_nights_tells_how_each_ended(night_run, night_log, monkeypatc
     assert [night["outcome"] for night in json.loads(text)] == ["without frames", "unchanged"]
 
 
-def test_a_night_that_fails_does_not_stop_the_next(night_run, night_log, monkeypatch):
+@pytest.fixture
+def fail_first(monkeypatch):
+    """Return a function after which 2019-03-31 fails with an error."""
     import epipole.flows.command_line.run_nightly as started
-    from epipole.schemas.errors import DatasetError
 
     real = started.unchanged_nights
 
-    def fail(dataset, given, night, *rest):
-        if night == "2019-03-31":
-            raise DatasetError("the disk is full")
-        return real(dataset, given, night, *rest)
+    def fail_with(error):
+        def fail(dataset, given, night, *rest):
+            if night == "2019-03-31":
+                raise error
+            return real(dataset, given, night, *rest)
 
-    monkeypatch.setattr(started, "unchanged_nights", fail)
+        monkeypatch.setattr(started, "unchanged_nights", fail)
+
+    return fail_with
+
+
+def test_a_night_that_fails_does_not_stop_the_next(night_run, night_log, fail_first):
+    from epipole.schemas.errors import DatasetError
+
+    fail_first(DatasetError("the disk is full"))
     code, text = run(night_log, "--out", night_run[0], "--night", "2019-03-31", "--to", NIGHT)
     assert code == 1
     assert text.splitlines() == [
@@ -94,18 +104,11 @@ def test_a_night_that_fails_does_not_stop_the_next(night_run, night_log, monkeyp
 
 
 def test_an_unforeseen_error_of_a_night_does_not_stop_the_next_either(
-    night_run, night_log, monkeypatch
+    night_run, night_log, fail_first, monkeypatch
 ):
     import epipole.flows.command_line.run_nightly as started
 
-    real = started.unchanged_nights
-
-    def fail(dataset, given, night, *rest):
-        if night == "2019-03-31":
-            raise RuntimeError("a bug")
-        return real(dataset, given, night, *rest)
-
-    monkeypatch.setattr(started, "unchanged_nights", fail)
+    fail_first(RuntimeError("a bug"))
     code, text = run(night_log, "--out", night_run[0], "--night", "2019-03-31", "--to", NIGHT)
     assert code == 1
     assert text.splitlines() == [

@@ -3,6 +3,7 @@
 import json
 import shutil
 
+import pytest
 from typer.testing import CliRunner
 
 from epipole.flows.command_line.main import app
@@ -18,9 +19,15 @@ def stale(*arguments) -> list[list[str]]:
     return [row["stale"] for row in json.loads(nights(*arguments, "--json").stdout)["nights"]]
 
 
-def test_logs_that_the_next_run_reads_otherwise_make_a_night_stale(night_dataset):
-    assert stale(night_dataset) == [[]]
-    assert stale(night_dataset, "--assume", "*.ahead_s=1") == [["other settings"]]
+@pytest.fixture
+def dataset(night_dataset, tmp_path):
+    """Return a copy of the dataset of one night, without the records of what other tests ran."""
+    return shutil.copytree(night_dataset, tmp_path / "out", ignore=shutil.ignore_patterns("runs"))
+
+
+def test_logs_that_the_next_run_reads_otherwise_make_a_night_stale(dataset):
+    assert stale(dataset) == [[]]
+    assert stale(dataset, "--assume", "*.ahead_s=1") == [["other settings"]]
 
 
 def test_settings_with_a_catalogue_that_is_missing_are_refused_in_one_line(night_dataset, tmp_path):
@@ -29,12 +36,11 @@ def test_settings_with_a_catalogue_that_is_missing_are_refused_in_one_line(night
     assert "gone.parquet: no such catalogue file" in ended.output
 
 
-def test_decades_without_a_night_are_one_line(night_dataset, tmp_path):
+def test_decades_without_a_night_are_one_line(dataset):
     # A sensor whose clock was never set writes 1980, where GPS begins.
-    out = shutil.copytree(night_dataset, tmp_path / "out")
-    shutil.copytree(out / "night=2019-04-01", out / "night=1980-01-06")
-    shutil.copytree(out / "night=2019-04-01", out / "night=2019-04-04")
-    shown = nights(out).stdout.splitlines()
+    shutil.copytree(dataset / "night=2019-04-01", dataset / "night=1980-01-06")
+    shutil.copytree(dataset / "night=2019-04-01", dataset / "night=2019-04-04")
+    shown = nights(dataset).stdout.splitlines()
     assert [line.split("  ")[0] for line in shown if line[:2] in ("19", "20")] == [
         "1980-01-06", "1980-01-07 to 2019-03-31", "2019-04-01", "2019-04-02", "2019-04-03",
         "2019-04-04",
